@@ -95,7 +95,7 @@ def test_missing_and_binary_files_are_refused(tmp_path):
 def test_poses_that_are_not_rigid_are_refused():
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 0] = 1.1
-    with pytest.raises(EvaluationError, match="pose 1 at 0.000000001 s"):
+    with pytest.raises(EvaluationError, match=r"pose 1 at 0\.000000001 s"):
         Trajectory(np.array([0, 1]), poses)
     with pytest.raises(EvaluationError, match="expected"):
         Trajectory(np.array([0]), poses)

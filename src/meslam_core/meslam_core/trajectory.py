@@ -85,7 +85,9 @@ class Trajectory:
         """The poses at `indices` (increasing)."""
         return Trajectory(self.stamps_ns[indices], self.poses[indices])
 
-    def transformed(self, T_left: NDArray, T_right: NDArray | None = None) -> Trajectory:
+    def transformed(
+        self, T_left: NDArray[np.floating], T_right: NDArray[np.floating] | None = None
+    ) -> Trajectory:
         """Every pose replaced by T_left @ pose @ T_right, both (4, 4); T_right may be left out."""
         poses = T_left @ self.poses
         return Trajectory(self.stamps_ns, poses if T_right is None else poses @ T_right)

@@ -123,7 +123,7 @@ def test_association_uses_every_pose_once_and_the_nearest():
 def test_trajectories_on_other_clocks_are_refused():
     truth = waving_path()
     other = Trajectory(truth.stamps_ns - 10**18, truth.poses)
-    with pytest.raises(EvaluationError, match="only 0 poses.*same clock"):
+    with pytest.raises(EvaluationError, match=r"only 0 poses.*same clock"):
         absolute_error(other, truth)
 
 

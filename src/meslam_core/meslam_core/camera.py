@@ -1,0 +1,154 @@
+"""The pinhole camera: projection, back-projection and registration of depth to colour."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meslam_core.errors import FrameError
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Intrinsics of an undistorted camera; x right, y down, z forward (REP-103 optical frame).
+
+    Pixel (u, v) is the centre of the pixel in column u and row v.
+
+    Attributes:
+        width, height: image size [px].
+        fx, fy: focal lengths [px].
+        cx, cy: principal point [px].
+
+    Raises:
+        FrameError: when a size or a focal length is not positive and finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy)
+        usable = all(np.isfinite(values)) and self.fx > 0 and self.fy > 0
+        if not usable or self.width <= 0 or self.height <= 0:
+            raise FrameError(
+                f"camera intrinsics are unusable: {self.width}x{self.height} fx={self.fx} "
+                f"fy={self.fy} cx={self.cx} cy={self.cy}; is the camera calibrated and does its "
+                "camera_info carry K?"
+            )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3x3 intrinsic matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def scaled(self, factor: float) -> PinholeCamera:
+        """The camera of an image resized by `factor` (0.5 halves each side)."""
+        return PinholeCamera(
+            width=round(self.width * factor),
+            height=round(self.height * factor),
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=(self.cx + 0.5) * factor - 0.5,
+            cy=(self.cy + 0.5) * factor - 0.5,
+        )
+
+    def ray_directions(
+        self, u: NDArray[np.floating], v: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Directions with z = 1 through pixels (u, v), shape (..., 3), camera frame."""
+        x = (np.asarray(u, np.float64) - self.cx) / self.fx
+        y = (np.asarray(v, np.float64) - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], axis=-1).astype(np.float32)
+
+    def pixel_directions(self) -> NDArray[np.float32]:
+        """Directions with z = 1 of all pixels, shape (height, width, 3), camera frame."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return self.ray_directions(u, v)
+
+    def back_project(self, depth_m: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Points of a depth image (H, W) [m], shape (H, W, 3), camera frame; no depth gives 0."""
+        if depth_m.shape != (self.height, self.width):
+            raise FrameError(
+                f"depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, "
+                f"the camera {self.width}x{self.height}"
+            )
+        return self.pixel_directions() * depth_m[..., None].astype(np.float32)
+
+    def project(self, points: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray]:
+        """Project points (N, 3) [m, camera frame] to (u, v, z); u and v are NaN where z <= 0."""
+        z = points[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = np.where(z > 0, 1.0 / z, np.nan)
+        return points[:, 0] * inverse * self.fx + self.cx, (
+            points[:, 1] * inverse * self.fy + self.cy
+        ), z
+
+    def to_dict(self) -> dict[str, float]:
+        """Plain numbers, as in a `camera.json`."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, path: Path) -> PinholeCamera:
+        """Read a `camera.json` with width, height, fx, fy, cx, cy.
+
+        Raises:
+            FrameError: when the file is unreadable or a key is missing.
+        """
+        try:
+            values = json.loads(Path(path).read_text())
+            return cls(
+                width=int(values["width"]),
+                height=int(values["height"]),
+                **{key: float(values[key]) for key in ("fx", "fy", "cx", "cy")},
+            )
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise FrameError(
+                f"{path} is not a camera description ({error!r}); "
+                "expected JSON with width, height, fx, fy, cx, cy"
+            ) from error
+
+
+def register_depth_to_color(
+    depth_m: NDArray[np.float32],
+    depth_camera: PinholeCamera,
+    color_camera: PinholeCamera,
+    T_color_depth: NDArray[np.floating],
+) -> NDArray[np.float32]:
+    """Warp a depth image into the colour camera with a z-buffer.
+
+    Args:
+        depth_m: (h, w) depth in the depth camera [m], 0 where unknown.
+        depth_camera, color_camera: intrinsics of both.
+        T_color_depth: (4, 4) maps depth-camera coordinates to colour-camera coordinates [m].
+
+    Returns:
+        (H, W) float32 depth in the colour camera [m], 0 where nothing projects.
+    """
+    points = depth_camera.back_project(depth_m).reshape(-1, 3)
+    points = points[points[:, 2] > 0].astype(np.float64)
+    points = points @ np.asarray(T_color_depth)[:3, :3].T + np.asarray(T_color_depth)[:3, 3]
+    u, v, z = color_camera.project(points)
+    # A pixel of a coarser depth image covers several of a finer colour image.
+    half_u = 0.5 * color_camera.fx / depth_camera.fx
+    half_v = 0.5 * color_camera.fy / depth_camera.fy
+    registered = np.full(color_camera.width * color_camera.height, np.inf, np.float32)
+    steps_u = range(int(np.ceil(2 * half_u)))
+    steps_v = range(int(np.ceil(2 * half_v)))
+    u_first, v_first = np.floor(u - half_u + 1), np.floor(v - half_v + 1)
+    for step_v in steps_v:
+        for step_u in steps_u:
+            column, row = u_first + step_u, v_first + step_v
+            inside = (column >= 0) & (column < color_camera.width)
+            inside &= (row >= 0) & (row < color_camera.height) & (z > 0)
+            index = (row[inside] * color_camera.width + column[inside]).astype(np.int64)
+            np.minimum.at(registered, index, z[inside].astype(np.float32))
+    registered[~np.isfinite(registered)] = 0.0
+    return registered.reshape(color_camera.height, color_camera.width)

@@ -1,0 +1,435 @@
+"""All numbers of the system: defaults, units, ranges and meanings stand here and nowhere else.
+
+The YAML parameter files, the ROS parameter descriptors and `docs/parameters.md` are generated
+from these classes (`meslam_core.config_reference`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import yaml
+
+from meslam_core.errors import ConfigError
+
+T = TypeVar("T", int, float, bool, str)
+
+
+def setting(
+    default: T,
+    meaning: str,
+    *,
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> T:
+    """A dataclass field that carries its unit, range and meaning."""
+    metadata = {
+        "meaning": meaning,
+        "unit": unit,
+        "minimum": minimum,
+        "maximum": maximum,
+        "choices": choices,
+    }
+    return dataclasses.field(default=default, metadata=metadata)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One number of the configuration with everything known about it."""
+
+    section: str
+    name: str
+    default: int | float | bool | str
+    meaning: str
+    unit: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple[str, ...]
+
+    @property
+    def path(self) -> str:
+        """`section.name`, as in `--set` and in ROS parameters."""
+        return f"{self.section}.{self.name}"
+
+    def checked(self, value: Any) -> int | float | bool | str:
+        """`value` in the setting's type.
+
+        Raises:
+            ConfigError: when the type is wrong or the value out of range.
+        """
+        kind = type(self.default)
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not kind:
+            raise ConfigError(
+                f"{self.path} = {value!r} is {type(value).__name__}, expected {kind.__name__}"
+            )
+        if self.choices and value not in self.choices:
+            raise ConfigError(f"{self.path} = {value!r}; choose one of {', '.join(self.choices)}")
+        below = self.minimum is not None and not value >= self.minimum
+        above = self.maximum is not None and not value <= self.maximum
+        if below or above:
+            raise ConfigError(
+                f"{self.path} = {value} is outside [{self.minimum}, {self.maximum}] {self.unit}"
+            )
+        return value
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """What of a depth image is believed."""
+
+    min_depth_m: float = setting(
+        0.2, "nearer measurements are ignored", unit="m", minimum=0.01, maximum=5.0
+    )
+    max_depth_m: float = setting(
+        5.0, "farther measurements are ignored", unit="m", minimum=0.3, maximum=30.0
+    )
+    edge_threshold: float = setting(
+        0.05,
+        "pixels whose depth differs from a neighbour's by more than this share are edges",
+        minimum=0.005,
+        maximum=1.0,
+    )
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """Frame-to-keyframe odometry (Sec. II-A)."""
+
+    method: str = setting(
+        "hybrid",
+        "'hybrid': RGB-D odometry with photometric and geometric terms; "
+        "'colored_icp': coloured point-cloud registration as in the paper",
+        choices=("hybrid", "colored_icp"),
+    )
+    image_width: int = setting(
+        320, "images are reduced to at most this width", unit="px", minimum=80, maximum=1920
+    )
+    voxel_size_m: float = setting(
+        0.05, "point spacing of coloured registration", unit="m", minimum=0.005, maximum=0.5
+    )
+    max_distance_m: float = setting(
+        0.07, "correspondences farther apart are outliers", unit="m", minimum=0.005, maximum=1.0
+    )
+    keyframe_translation_m: float = setting(
+        0.15, "a new odometry keyframe after this motion", unit="m", minimum=0.01, maximum=2.0
+    )
+    keyframe_rotation_deg: float = setting(
+        12.0, "a new odometry keyframe after this rotation", unit="deg", minimum=0.5, maximum=90.0
+    )
+    min_fitness: float = setting(
+        0.4,
+        "share of points with a correspondence below which a result is invalid",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    max_speed_m_s: float = setting(
+        3.0, "faster motion is not believed", unit="m/s", minimum=0.1, maximum=50.0
+    )
+    max_turn_deg_s: float = setting(
+        300.0, "faster turning is not believed", unit="deg/s", minimum=10.0, maximum=3000.0
+    )
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Architecture of a region's network (Sec. II-B) and how density follows from it."""
+
+    width: int = setting(
+        64, "units of a hidden layer: 64, 128 or 256", minimum=16, maximum=512
+    )
+    embedding: int = setting(
+        96, "sine features of the Gaussian positional embedding", minimum=8, maximum=512
+    )
+    embedding_sigma: float = setting(
+        9.0,
+        "standard deviation of the embedding's frequencies, region coordinates",
+        minimum=0.5,
+        maximum=50.0,
+    )
+    density_scale: float = setting(
+        500.0,
+        "density is this times the positive part of the first output",
+        unit="1/m",
+        minimum=10.0,
+        maximum=10000.0,
+    )
+    truncation_m: float = setting(
+        0.10, "distance at which the signed distance saturates", unit="m", minimum=0.01, maximum=1.0
+    )
+    backend: str = setting(
+        "auto",
+        "'kernel': compiled field kernel on the CPU; 'torch': reference; 'auto': GPU, else kernel",
+        choices=("auto", "kernel", "torch"),
+    )
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Pose of a frame by Gauss-Newton on the field."""
+
+    points: int = setting(1500, "pixels used for one pose", minimum=100, maximum=50000)
+    iterations: int = setting(10, "at most this many steps", minimum=1, maximum=100)
+    convergence: float = setting(
+        3e-4, "a step smaller than this ends the search", unit="m", minimum=1e-6, maximum=0.01
+    )
+    huber_wide_m: float = setting(
+        0.08, "robust threshold of the first step", unit="m", minimum=0.001, maximum=1.0
+    )
+    huber_narrow_m: float = setting(
+        0.02, "robust threshold of the last step", unit="m", minimum=0.001, maximum=1.0
+    )
+    color_weight: float = setting(
+        0.15, "weight of the colour residual (0 switches it off)", minimum=0.0, maximum=10.0
+    )
+    min_inlier_ratio: float = setting(
+        0.35, "share of inliers below which a pose is not trusted", minimum=0.0, maximum=1.0
+    )
+    inlier_distance_m: float = setting(
+        0.05, "a point this near to the surface is an inlier", unit="m", minimum=0.002, maximum=0.5
+    )
+    max_residual_m: float = setting(
+        0.04,
+        "median residual above which a pose is not trusted",
+        unit="m",
+        minimum=0.001,
+        maximum=0.5,
+    )
+    lost_after_frames: int = setting(
+        10, "untrusted poses in a row after which tracking is lost", minimum=1, maximum=1000
+    )
+
+
+@dataclass(frozen=True)
+class KeyframesConfig:
+    """When a frame becomes a keyframe and what is kept of it."""
+
+    agreement: float = setting(
+        0.65,
+        "a frame becomes a keyframe when less than this share of its pixels agrees with the "
+        "rendered depth (iMAP)",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    agreement_tolerance: float = setting(
+        0.1, "relative depth error up to which a pixel agrees", minimum=0.001, maximum=1.0
+    )
+    translation_m: float = setting(
+        0.20, "or when it moved this far from its reference", unit="m", minimum=0.01, maximum=5.0
+    )
+    rotation_deg: float = setting(
+        15.0, "or turned this much", unit="deg", minimum=0.5, maximum=180.0
+    )
+    overlap: float = setting(
+        0.75,
+        "or when less than this share of its points projects into its reference",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    rays: int = setting(
+        8192, "pixels kept of a keyframe for training", minimum=256, maximum=200000
+    )
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """Joint optimisation of weights and poses (Sec. II-B)."""
+
+    rays: int = setting(200, "rays of keyframes in a step", minimum=8, maximum=20000)
+    current_rays: int = setting(
+        50, "rays of the current frame in a step", minimum=0, maximum=20000
+    )
+    free_samples: int = setting(5, "samples of a ray in free space", minimum=1, maximum=64)
+    surface_samples: int = setting(4, "samples of a ray near the surface", minimum=1, maximum=64)
+    surface_sigma_m: float = setting(
+        0.04, "spread of the samples near the surface", unit="m", minimum=0.005, maximum=0.5
+    )
+    first_iterations: int = setting(
+        300, "steps on the first frame", minimum=1, maximum=10000
+    )
+    iterations: int = setting(16, "steps a frame", minimum=0, maximum=1000)
+    keyframe_iterations: int = setting(40, "steps on a new keyframe", minimum=0, maximum=1000)
+    final_iterations: int = setting(
+        500, "steps after the last frame of a recording", minimum=0, maximum=100000
+    )
+    budget_ms: float = setting(
+        0.0,
+        "mapping time a frame, 0 for no limit; the number of steps adapts",
+        unit="ms",
+        minimum=0.0,
+        maximum=10000.0,
+    )
+    learning_rate: float = setting(
+        4e-3, "Adam's step for the weights", minimum=1e-6, maximum=0.1
+    )
+    pose_learning_rate: float = setting(
+        2e-3, "Adam's step for keyframe poses", unit="m, rad", minimum=0.0, maximum=0.1
+    )
+    pose_decay_steps: float = setting(
+        1000.0, "the poses' step halves after this many steps", minimum=1.0, maximum=1e9
+    )
+    latest_share: float = setting(
+        0.2, "share of the keyframe rays drawn from the last keyframe", minimum=0.0, maximum=1.0
+    )
+    distance_weight: float = setting(
+        5.0, "weight of the signed-distance loss", minimum=0.0, maximum=100.0
+    )
+    depth_weight: float = setting(
+        0.5, "weight of the rendered-depth loss", minimum=0.0, maximum=100.0
+    )
+    color_weight: float = setting(
+        1.0, "weight of the rendered-colour loss", minimum=0.0, maximum=100.0
+    )
+    depth_clip_m: float = setting(
+        0.2, "rendered-depth errors count up to this", unit="m", minimum=0.01, maximum=10.0
+    )
+
+
+@dataclass(frozen=True)
+class RegionsConfig:
+    """Distribution of networks in space (Sec. II-C)."""
+
+    volume_m3: float = setting(
+        30.0, "volume of a region's box (a cube)", unit="m^3", minimum=0.1, maximum=10000.0
+    )
+    overlap: float = setting(
+        0.2, "share of a region's side that it has in common with a neighbour",
+        minimum=0.01,
+        maximum=0.49,
+    )
+    hysteresis_m: float = setting(
+        0.05,
+        "how far past the middle of an intersection the working region changes",
+        unit="m",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    mask_voxel_m: float = setting(
+        0.08, "voxel of the mask of observed space", unit="m", minimum=0.02, maximum=0.5
+    )
+    mask_extent: float = setting(
+        3.0,
+        "half-sides of the box up to which a region remembers what it saw",
+        minimum=1.0,
+        maximum=6.0,
+    )
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """What is answered from the stored networks, and how."""
+
+    mesh_resolution_m: float = setting(
+        0.02, "default spacing of a mesh", unit="m", minimum=0.002, maximum=1.0
+    )
+    blend_length: float = setting(
+        0.25,
+        "half-sides over which a region's weight falls by e from its centre",
+        minimum=0.01,
+        maximum=10.0,
+    )
+    codec: str = setting(
+        "int8", "how weights are stored", choices=("int8", "fp16", "fp32")
+    )
+
+
+@dataclass(frozen=True)
+class MeslamConfig:
+    """The whole configuration, one section a part of the system."""
+
+    sensor: SensorConfig = SensorConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    field: FieldConfig = FieldConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframesConfig = KeyframesConfig()
+    mapping: MappingConfig = MappingConfig()
+    regions: RegionsConfig = RegionsConfig()
+    map: MapConfig = MapConfig()
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Mapping[str, Any]]) -> MeslamConfig:
+        """Defaults with `{section: {name: value}}` in their place.
+
+        Raises:
+            ConfigError: for unknown sections or names, wrong types, values out of range.
+        """
+        known = {(s.section, s.name): s for s in settings()}
+        sections: dict[str, dict[str, Any]] = {}
+        for section, entries in values.items():
+            if not isinstance(entries, Mapping):
+                raise ConfigError(f"section {section!r} holds {entries!r}, expected a mapping")
+            for name, value in entries.items():
+                if (section, name) not in known:
+                    raise ConfigError(
+                        f"there is no setting {section}.{name}; {_suggestion(section, name)}"
+                    )
+                sections.setdefault(section, {})[name] = known[section, name].checked(value)
+        config = cls()
+        return dataclasses.replace(
+            config,
+            **{s: dataclasses.replace(getattr(config, s), **v) for s, v in sections.items()},
+        )
+
+    @classmethod
+    def from_overrides(
+        cls, overrides: Sequence[str], preset: str = "default"
+    ) -> MeslamConfig:
+        """The configuration of a preset with `section.name=value` texts applied in order.
+
+        Raises:
+            ConfigError: as `from_mapping`, and for malformed texts or unknown presets.
+        """
+        if preset not in PRESETS:
+            raise ConfigError(f"there is no preset {preset!r}; choose one of {', '.join(PRESETS)}")
+        values: dict[str, dict[str, Any]] = {s: dict(v) for s, v in PRESETS[preset].items()}
+        for text in overrides:
+            path, equals, value = text.partition("=")
+            section, dot, name = path.strip().partition(".")
+            if not equals or not dot:
+                raise ConfigError(f"{text!r} is not of the form section.name=value")
+            values.setdefault(section, {})[name] = _parsed(value)
+        return cls.from_mapping(values)
+
+    def to_mapping(self) -> dict[str, dict[str, Any]]:
+        """`{section: {name: value}}` of all settings."""
+        return dataclasses.asdict(self)
+
+
+def _parsed(text: str) -> Any:
+    """A YAML scalar; YAML 1.1 takes 3e-4 for a string, people mean a number."""
+    value = yaml.safe_load(text)
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return value
+
+
+def _suggestion(section: str, name: str) -> str:
+    names = [s.name for s in settings() if s.section == section]
+    if names:
+        return f"section {section} has {', '.join(names)}"
+    return f"sections are {', '.join(f.name for f in dataclasses.fields(MeslamConfig))}"
+
+
+def settings() -> Iterator[Setting]:
+    """Every setting in the order of its declaration."""
+    for section in dataclasses.fields(MeslamConfig):
+        for entry in dataclasses.fields(type(getattr(MeslamConfig(), section.name))):
+            yield Setting(
+                section=section.name, name=entry.name, default=entry.default, **entry.metadata
+            )
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "default": {},
+    "fine": {"field": {"width": 128}},
+    "paper": {"field": {"width": 256}, "odometry": {"method": "colored_icp"}},
+}

@@ -1,0 +1,161 @@
+"""The two registrations: coloured point clouds (the paper's) and hybrid RGB-D odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from meslam_core.camera import PinholeCamera
+from meslam_core.config import OdometryConfig, SensorConfig
+from meslam_core.frame import RgbdFrame
+from meslam_core.se3 import Pose
+
+# Coarse to fine; every level runs until it converges, because a few fixed steps from a bad
+# guess leave degrees of error under fast rotation.
+HYBRID_ITERATIONS = (20, 15, 10)
+COLORED_ITERATIONS = 50
+NORMAL_NEIGHBORS = 20
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How the source frame lies in the target's.
+
+    Attributes:
+        T_target_source: (4, 4).
+        information: (6, 6) of (rotation, translation), Open3D's order.
+        fitness: share of points with a correspondence.
+        residual_m: RMS distance of the correspondences [m].
+    """
+
+    T_target_source: Pose
+    information: NDArray[np.float64]
+    fitness: float
+    residual_m: float
+
+
+class Registrar(Protocol):
+    """Prepares frames once and registers prepared pairs."""
+
+    def prepare(self, frame: RgbdFrame) -> Any:
+        """What registration needs of a frame."""
+        ...
+
+    def register(self, source: Any, target: Any, T_target_source: Pose) -> Registration:
+        """Register two prepared frames from a first guess.
+
+        Raises:
+            RuntimeError: when the frames cannot be registered (Open3D's).
+        """
+        ...
+
+
+def _reduced(
+    frame: RgbdFrame, odometry: OdometryConfig, sensor: SensorConfig
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], PinholeCamera]:
+    """Colour, depth and camera at the odometry's resolution, a power of two smaller."""
+    color, depth, camera = frame.color, frame.depth_m, frame.camera
+    while camera.width > odometry.image_width and min(camera.width, camera.height) % 2 == 0:
+        color = cv2.resize(color, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        # Averaging depth would invent points between foreground and background.
+        depth = depth[::2, ::2]
+        camera = PinholeCamera(
+            camera.width // 2,
+            camera.height // 2,
+            camera.fx / 2,
+            camera.fy / 2,
+            camera.cx / 2,
+            camera.cy / 2,
+        )
+    usable = (depth >= sensor.min_depth_m) & (depth <= sensor.max_depth_m)
+    return color, np.where(usable, depth, np.float32(0.0)), camera
+
+
+class HybridRegistrar:
+    """Open3D's RGB-D odometry with photometric and geometric terms on an image pyramid."""
+
+    def __init__(self, odometry: OdometryConfig, sensor: SensorConfig) -> None:
+        self._odometry = odometry
+        self._sensor = sensor
+        self._criteria = [
+            o3d.t.pipelines.odometry.OdometryConvergenceCriteria(n, 1e-6, 1e-6)
+            for n in HYBRID_ITERATIONS
+        ]
+
+    def prepare(self, frame: RgbdFrame) -> tuple[Any, Any]:
+        color, depth, camera = _reduced(frame, self._odometry, self._sensor)
+        image = o3d.t.geometry.RGBDImage(
+            o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color))),
+            o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth))),
+        )
+        return image, o3d.core.Tensor(camera.matrix)
+
+    def register(
+        self, source: tuple[Any, Any], target: tuple[Any, Any], T_target_source: Pose
+    ) -> Registration:
+        odometry = o3d.t.pipelines.odometry
+        limit = self._odometry.max_distance_m
+        result = odometry.rgbd_odometry_multi_scale(
+            source[0],
+            target[0],
+            source[1],
+            o3d.core.Tensor(T_target_source),
+            1.0,
+            self._sensor.max_depth_m,
+            self._criteria,
+            odometry.Method.Hybrid,
+            odometry.OdometryLossParams(limit),
+        )
+        transformation = result.transformation.numpy()
+        information = odometry.compute_odometry_information_matrix(
+            source[0].depth, target[0].depth, source[1], result.transformation, limit, 1.0,
+            self._sensor.max_depth_m,
+        )
+        return Registration(
+            transformation, information.numpy(), result.fitness, result.inlier_rmse
+        )
+
+
+class ColoredIcpRegistrar:
+    """Coloured point-cloud registration (Park et al. 2017), the paper's odometry."""
+
+    def __init__(self, odometry: OdometryConfig, sensor: SensorConfig) -> None:
+        self._odometry = odometry
+        self._sensor = sensor
+
+    def prepare(self, frame: RgbdFrame) -> Any:
+        color, depth, camera = _reduced(frame, self._odometry, self._sensor)
+        rows, columns = np.nonzero(depth)
+        points = camera.ray_directions(columns, rows) * depth[rows, columns][:, None]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
+        cloud.colors = o3d.utility.Vector3dVector(color[rows, columns] / 255.0)
+        cloud = cloud.voxel_down_sample(self._odometry.voxel_size_m)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBORS))
+        cloud.orient_normals_towards_camera_location()
+        return cloud
+
+    def register(self, source: Any, target: Any, T_target_source: Pose) -> Registration:
+        registration = o3d.pipelines.registration
+        limit = 2.0 * self._odometry.max_distance_m
+        result = registration.registration_colored_icp(
+            source,
+            target,
+            limit,
+            T_target_source,
+            registration.TransformationEstimationForColoredICP(),
+            registration.ICPConvergenceCriteria(1e-6, 1e-6, COLORED_ITERATIONS),
+        )
+        information = registration.get_information_matrix_from_point_clouds(
+            source, target, limit, result.transformation
+        )
+        return Registration(
+            np.array(result.transformation),
+            np.array(information),
+            result.fitness,
+            result.inlier_rmse,
+        )

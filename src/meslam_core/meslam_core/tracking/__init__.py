@@ -1,0 +1,1 @@
+"""Where the camera is: Gauss-Newton on the field, and the checks a pose must pass."""

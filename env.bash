@@ -15,7 +15,7 @@ _meslam_env() {
     # shellcheck disable=SC1091
     source "$ros_prefix/setup.bash" || return 1
   fi
-  if [ "${VIRTUAL_ENV:-}" != "$venv" ] || [ "${PATH%%:*}" != "$venv/bin" ]; then
+  if [ "${VIRTUAL_ENV:-}" != "$venv" ] || [[ ":$PATH:" != *":$venv/bin:"* ]]; then
     # shellcheck disable=SC1091
     source "$venv/bin/activate" || return 1
   fi

@@ -1,0 +1,38 @@
+# The words of the README. `make help` lists them.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help setup build test demo lint format typecheck config clean
+
+RECORDING ?=
+PYTEST_ARGS ?=
+IN_ENV := source env.bash &&
+
+help:  ## show this list
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */  make \1\t/' | expand -t 18
+
+setup:  ## install and build everything; takes seconds when nothing has changed
+	@tools/setup.sh
+
+build:  ## build the workspace even if nothing has changed
+	@tools/setup.sh --rebuild
+
+test: setup  ## run all tests; PYTEST_ARGS="test/core -k name" runs some
+	@$(IN_ENV) python -m pytest $(PYTEST_ARGS)
+
+demo: setup  ## map a simulated room, or RECORDING=path, with the real nodes; results in out/
+	@$(IN_ENV) python tools/demo.py $(if $(RECORDING),"$(RECORDING)")
+
+lint: setup  ## check style and formatting
+	@$(IN_ENV) ruff check . && ruff format --check .
+
+format: setup  ## correct style and formatting
+	@$(IN_ENV) ruff check --fix . ; ruff format .
+
+typecheck: setup  ## check the types of the core
+	@$(IN_ENV) mypy
+
+config: setup  ## write the parameter files and their reference from the typed configuration
+	@$(IN_ENV) python -m meslam_core.config_reference
+
+clean:  ## remove everything that `make setup` and `make demo` made, but recordings
+	rm -rf .venv build install log out

@@ -1,0 +1,326 @@
+"""The pipeline: odometry gives a first guess, tracking refines it, joint optimisation maps."""
+
+from __future__ import annotations
+
+import enum
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from meslam_core.config import MeslamConfig
+from meslam_core.frame import RgbdFrame
+from meslam_core.mapping.joint_optimizer import JointOptimizer, StepLosses
+from meslam_core.mapping.keyframe_policy import KeyframePolicy
+from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
+from meslam_core.odometry import OdometryEstimate
+from meslam_core.regions.atlas import RegionAtlas
+from meslam_core.se3 import Pose, exp, inverse, log, orthonormalized
+from meslam_core.tracking.field_tracker import Alignment, FieldTracker
+from meslam_core.tracking.pixels import choose_pixels, trusted_pixels
+from meslam_core.trajectory import Trajectory
+
+# The first camera looks along the map's x axis and z points up (REP-103).
+T_BODY_OPTICAL: Pose = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+CURRENT_FRAME_RAYS = 4096
+MIN_FRAME_PIXELS = 200
+UNTRUSTED_VARIANCE = 0.25
+
+
+class TrackingState(enum.IntEnum):
+    """How far the latest pose can be trusted."""
+
+    INITIALISING = 0
+    OK = 1
+    DEGRADED = 2
+    LOST = 3
+    RELOCALISING = 4
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What is known of a frame when its processing ends.
+
+    Attributes:
+        stamp_ns: of the image [ns].
+        T_map_camera: (4, 4) online pose.
+        covariance: (6, 6) of (translation [m], rotation [rad]), map axes.
+        state, reason: of tracking.
+        odometry: estimate it started from, if there was one.
+        residual_m: median distance of the frame's points to the mapped surface [m].
+        inlier_ratio: share of points near the surface.
+        losses: mean of the mapping steps.
+        iterations: mapping steps taken.
+        is_keyframe: whether the frame became a keyframe.
+        tracking_ms, mapping_ms: time spent.
+    """
+
+    stamp_ns: int
+    T_map_camera: Pose
+    covariance: NDArray[np.float64]
+    state: TrackingState
+    reason: str
+    odometry: OdometryEstimate | None
+    residual_m: float
+    inlier_ratio: float
+    losses: StepLosses
+    iterations: int
+    is_keyframe: bool
+    tracking_ms: float
+    mapping_ms: float
+
+
+@dataclass
+class _TrackedFrame:
+    """A frame's place in the trajectory: relative to a keyframe, so that it moves with it."""
+
+    stamp_ns: int
+    T_map_camera_online: Pose
+    keyframe: int
+    T_keyframe_camera: Pose
+    odometry: OdometryEstimate | None = field(repr=False, default=None)
+
+
+class Slam:
+    """Tracks frames and maps what they see.
+
+    Frames come in the order of their stamps; one object serves one continuous recording.
+
+    Args:
+        config: all numbers.
+        seed: of every random choice; the same frames and seed give the same result.
+        T_map_camera: (4, 4) pose of the first frame; by default the first camera defines the
+            map frame, x forward and z up.
+    """
+
+    def __init__(
+        self, config: MeslamConfig, seed: int = 0, T_map_camera: Pose = T_BODY_OPTICAL
+    ) -> None:
+        self.config = config
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.keyframes = KeyframeStore(config.keyframes.rays, self.device)
+        self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
+        self.tracker = FieldTracker(config.tracking)
+        self.policy = KeyframePolicy(config.keyframes, config.field)
+        self.atlas: RegionAtlas | None = None
+        self.state = TrackingState.INITIALISING
+        self._seed = seed
+        self._generator = np.random.default_rng(seed)
+        self._T_map_first = T_map_camera
+        self._frames: list[_TrackedFrame] = []
+        self._untrusted = 0
+
+    def process(self, frame: RgbdFrame, odometry: OdometryEstimate | None = None) -> FrameResult:
+        """Track one frame and train the map with it.
+
+        Args:
+            frame: the next image pair.
+            odometry: its external odometry; without one, the last motion is continued.
+        """
+        started = time.perf_counter()
+        pixels = trusted_pixels(frame.depth_m, self.config.sensor)
+        enough = np.count_nonzero(pixels) >= MIN_FRAME_PIXELS
+        if self.atlas is None and enough:
+            return self._start(frame, pixels, odometry, started)
+        alignment, reason = None, "too few pixels with depth"
+        if self.atlas is not None and enough:
+            alignment, reason = self._track(frame, pixels, odometry)
+        pose = self._accept(alignment, reason, odometry)
+        tracked = time.perf_counter()
+        losses, iterations, is_keyframe = StepLosses(), 0, False
+        if self.atlas is not None and not reason:
+            losses, iterations, is_keyframe = self._map(frame, pixels, pose)
+        self._remember(frame, pose, odometry)
+        mapped = time.perf_counter()
+        return FrameResult(
+            stamp_ns=frame.stamp_ns,
+            T_map_camera=pose,
+            covariance=_covariance(alignment, reason),
+            state=self.state,
+            reason=reason,
+            odometry=odometry,
+            residual_m=alignment.residual_m if alignment else float("inf"),
+            inlier_ratio=alignment.inlier_ratio if alignment else 0.0,
+            losses=losses,
+            iterations=iterations,
+            is_keyframe=is_keyframe,
+            tracking_ms=(tracked - started) * 1e3,
+            mapping_ms=(mapped - tracked) * 1e3,
+        )
+
+    def finish(self) -> None:
+        """Refine keyframes and map once more over everything seen; then update the masks."""
+        if self.atlas is None:
+            return
+        total = sum(len(region.keyframes) for region in self.atlas.regions.values())
+        for region in self.atlas.regions.values():
+            share = len(region.keyframes) / max(total, 1)
+            self.optimizer.train(region, round(self.config.mapping.final_iterations * share))
+            region.version += 1
+        self.atlas.rebuild_masks()
+
+    def trajectory(self) -> Trajectory:
+        """T_map_camera of every tracked frame as it is known now."""
+        return Trajectory(
+            self._stamps(),
+            np.array(
+                [self.keyframes.pose(f.keyframe) @ f.T_keyframe_camera for f in self._frames]
+            ).reshape(-1, 4, 4),
+        )
+
+    def online_trajectory(self) -> Trajectory:
+        """T_map_camera of every frame as it was known when the frame was done."""
+        poses = [f.T_map_camera_online for f in self._frames]
+        return Trajectory(self._stamps(), np.array(poses).reshape(-1, 4, 4))
+
+    def _stamps(self) -> NDArray[np.int64]:
+        return np.array([f.stamp_ns for f in self._frames], np.int64)
+
+    def _start(
+        self,
+        frame: RgbdFrame,
+        pixels: NDArray[np.bool_],
+        odometry: OdometryEstimate | None,
+        started: float,
+    ) -> FrameResult:
+        """The first frame defines the map frame and trains the first region from nothing."""
+        pose = self._T_map_first.copy()
+        self.atlas = RegionAtlas(self.config, pose[:3, 3], self.keyframes, self._seed)
+        self._add_keyframe(frame, pixels, pose)
+        steps = self.config.mapping.first_iterations
+        losses = self.optimizer.train(self.atlas.working, steps, refine_poses=False)
+        self.atlas.working.version += 1
+        self.state = TrackingState.OK
+        self._remember(frame, pose, odometry)
+        return FrameResult(
+            stamp_ns=frame.stamp_ns,
+            T_map_camera=pose,
+            covariance=np.eye(6) * 1e-8,
+            state=self.state,
+            reason="",
+            odometry=odometry,
+            residual_m=0.0,
+            inlier_ratio=1.0,
+            losses=losses,
+            iterations=steps,
+            is_keyframe=True,
+            tracking_ms=0.0,
+            mapping_ms=(time.perf_counter() - started) * 1e3,
+        )
+
+    def _sample(self, frame: RgbdFrame, pixels: NDArray[np.bool_], count: int) -> Rays:
+        return rays_at(frame, *choose_pixels(pixels, count, self._generator))
+
+    def _track(
+        self, frame: RgbdFrame, pixels: NDArray[np.bool_], odometry: OdometryEstimate | None
+    ) -> tuple[Alignment, str]:
+        """Align a frame with the working region; a reason when the pose is not to be trusted."""
+        assert self.atlas is not None
+        region = self.atlas.working
+        rays = self._sample(frame, pixels, self.config.tracking.points)
+        guesses = self._guesses(frame.stamp_ns, odometry)
+        costs = [self.tracker.robust_cost(region, rays, guess) for guess in guesses]
+        alignment = self.tracker.align(region, rays, guesses[int(np.argmin(costs))])
+        return alignment, self._doubt(alignment)
+
+    def _guesses(self, stamp_ns: int, odometry: OdometryEstimate | None) -> list[Pose]:
+        """First guesses of a pose: odometry since the last frame, and constant velocity."""
+        guesses = []
+        last = self._frames[-1]
+        if odometry is not None and odometry.valid and last.odometry is not None:
+            motion = inverse(last.odometry.T_odom_camera) @ odometry.T_odom_camera
+            guesses.append(self._latest_pose() @ motion)
+        guesses.append(self._extrapolated(stamp_ns))
+        return [orthonormalized(guess) for guess in guesses]
+
+    def _latest_pose(self) -> Pose:
+        """The last frame's pose through its keyframe, which may have moved since."""
+        last = self._frames[-1]
+        return self.keyframes.pose(last.keyframe) @ last.T_keyframe_camera
+
+    def _extrapolated(self, stamp_ns: int) -> Pose:
+        latest = self._latest_pose()
+        if len(self._frames) < 2:
+            return latest
+        before, last = self._frames[-2], self._frames[-1]
+        T_map_before = self.keyframes.pose(before.keyframe) @ before.T_keyframe_camera
+        elapsed = max(last.stamp_ns - before.stamp_ns, 1)
+        ahead = min((stamp_ns - last.stamp_ns) / elapsed, 3.0)
+        return latest @ exp(ahead * log(orthonormalized(inverse(T_map_before) @ latest)))
+
+    def _doubt(self, alignment: Alignment) -> str:
+        """Why an alignment is not to be trusted; empty when it is."""
+        limits = self.config.tracking
+        if not np.isfinite(alignment.T_map_camera).all():
+            return "the pose is not finite"
+        if alignment.inlier_ratio < limits.min_inlier_ratio:
+            return f"only {alignment.inlier_ratio:.0%} of the points lie on the map"
+        if alignment.residual_m > limits.max_residual_m:
+            return f"points lie {alignment.residual_m * 100:.1f} cm off the map"
+        return ""
+
+    def _accept(
+        self, alignment: Alignment | None, reason: str, odometry: OdometryEstimate | None
+    ) -> Pose:
+        """The frame's pose and the tracking state that follows."""
+        if alignment is not None and not reason:
+            self._untrusted = 0
+            self.state = TrackingState.OK
+            return alignment.T_map_camera
+        if self.atlas is None:
+            return self._T_map_first.copy()
+        self._untrusted += 1
+        lost = self._untrusted >= self.config.tracking.lost_after_frames
+        self.state = TrackingState.LOST if lost else TrackingState.DEGRADED
+        stamp = odometry.stamp_ns if odometry else self._frames[-1].stamp_ns
+        return self._guesses(stamp, odometry)[0]
+
+    def _map(
+        self, frame: RgbdFrame, pixels: NDArray[np.bool_], pose: Pose
+    ) -> tuple[StepLosses, int, bool]:
+        """Update the regions for the pose, add a keyframe where due, and train."""
+        assert self.atlas is not None
+        self.atlas.update(pose[:3, 3])
+        region = self.atlas.working
+        is_keyframe = self.policy.is_keyframe(
+            region, self.keyframes, len(self.keyframes) - 1, frame.camera, pose,
+            self._sample(frame, pixels, self.policy.PIXELS),
+        )
+        if is_keyframe:
+            self._add_keyframe(frame, pixels, pose)
+        current = self._sample(frame, pixels, CURRENT_FRAME_RAYS)
+        mapping = self.config.mapping
+        steps = mapping.keyframe_iterations if is_keyframe else mapping.iterations
+        losses = self.optimizer.train(region, steps, current, pose)
+        region.version += 1
+        for neighbor in self.atlas.training:
+            self.optimizer.train(neighbor, steps // 2, current, pose, refine_poses=False)
+            neighbor.version += 1
+        return losses, steps, is_keyframe
+
+    def _add_keyframe(self, frame: RgbdFrame, pixels: NDArray[np.bool_], pose: Pose) -> None:
+        assert self.atlas is not None
+        rays = self._sample(frame, pixels, self.config.keyframes.rays)
+        self.atlas.add_keyframe(self.keyframes.add(frame.stamp_ns, pose, rays))
+
+    def _remember(
+        self, frame: RgbdFrame, pose: Pose, odometry: OdometryEstimate | None
+    ) -> None:
+        if not len(self.keyframes):
+            return
+        reference = len(self.keyframes) - 1
+        T_keyframe_camera = orthonormalized(inverse(self.keyframes.pose(reference)) @ pose)
+        self._frames.append(
+            _TrackedFrame(frame.stamp_ns, pose, reference, T_keyframe_camera, odometry)
+        )
+
+
+def _covariance(alignment: Alignment | None, reason: str) -> NDArray[np.float64]:
+    if alignment is None or reason:
+        return np.eye(6) * UNTRUSTED_VARIANCE
+    information = alignment.information + np.eye(6)
+    return np.linalg.inv(information)

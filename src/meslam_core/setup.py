@@ -5,6 +5,8 @@ from pathlib import Path
 from setuptools import Extension, find_packages, setup
 
 NAME = "meslam_core"
+# colcon runs a symlink of this file in its build folder: the folders beside the real file count.
+KERNEL_DIR = Path(__file__).resolve().parent / "src_cpp"
 
 
 def kernel_extensions() -> list[Extension]:
@@ -13,7 +15,7 @@ def kernel_extensions() -> list[Extension]:
     `optional` turns a failed compilation into a warning: the package then works with its
     reference implementation alone.
     """
-    sources = sorted(path.as_posix() for path in Path("src_cpp").glob("*.cpp"))
+    sources = sorted(map(str, KERNEL_DIR.glob("*.cpp")))
     if not sources:
         return []
     try:
@@ -26,8 +28,8 @@ def kernel_extensions() -> list[Extension]:
             f"{NAME}.field._kernel",
             sources,
             cxx_std=17,
-            include_dirs=["src_cpp"],
-            depends=sorted(path.as_posix() for path in Path("src_cpp").glob("*.h*")),
+            include_dirs=[str(KERNEL_DIR)],
+            depends=sorted(map(str, KERNEL_DIR.glob("*.h*"))),
             extra_compile_args=["-O3"],
             optional=True,
         )

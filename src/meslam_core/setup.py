@@ -30,7 +30,8 @@ def kernel_extensions() -> list[Extension]:
             cxx_std=17,
             include_dirs=[str(KERNEL_DIR)],
             depends=sorted(map(str, KERNEL_DIR.glob("*.h*"))),
-            extra_compile_args=["-O3"],
+            # No -ffast-math: it would let the compiler assume that no number is infinite or NaN.
+            extra_compile_args=["-O3", "-fno-math-errno", "-fno-trapping-math"],
             optional=True,
         )
     ]

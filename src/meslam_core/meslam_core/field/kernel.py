@@ -1,0 +1,151 @@
+"""The compiled field kernel: the network of `network.py`, fused, on one or more CPU cores.
+
+One pass over blocks of samples that stay in cache computes embedding, layers and outputs; on the
+way back the gradients of weights, embedding and points together. Which instructions it uses is
+found at run time; the environment variable MESLAM_KERNEL_ISA caps the choice.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from meslam_core.config import FieldConfig
+from meslam_core.errors import ConfigError
+from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON
+from meslam_core.field.network import FieldNetwork
+
+_import_error = ""
+try:
+    from meslam_core.field import _kernel
+except ImportError as error:
+    _import_error = str(error)
+
+Floats = NDArray[np.float32]
+
+WIDTHS = (64, 128, 256)
+EMBEDDING_MULTIPLE = 32
+
+
+def unavailable_reason(config: FieldConfig | None = None) -> str:
+    """Why the kernel cannot be used, for people; empty where it can.
+
+    Args:
+        config: of the field that it should compute; None asks about the extension alone.
+    """
+    if _import_error:
+        return f"the compiled field kernel is not installed ({_import_error})"
+    if config is None:
+        return ""
+    if config.width not in WIDTHS:
+        return f"the compiled field kernel has widths {WIDTHS}, not {config.width}"
+    if config.embedding % EMBEDDING_MULTIPLE:
+        return (
+            f"the compiled field kernel takes embeddings in multiples of {EMBEDDING_MULTIPLE}, "
+            f"not {config.embedding}"
+        )
+    return ""
+
+
+def available_isas() -> tuple[str, ...]:
+    """Instruction sets usable here, the best first; empty without the extension.
+
+    Raises:
+        ConfigError: MESLAM_KERNEL_ISA names none that exists.
+    """
+    if _import_error:
+        return ()
+    try:
+        return tuple(_kernel.available_isas())
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+class KernelField:
+    """`FieldModel` on the compiled kernel.
+
+    Args:
+        config: width 64, 128 or 256; embedding a multiple of 32.
+        seed: of the initial weights, the same that `FieldNetwork` draws.
+        isa: 'auto' (the best there is) or one of `available_isas`.
+        threads: of this field alone; its calls from several threads follow one another.
+
+    Raises:
+        ConfigError: the extension is missing, or has no code for the sizes or instruction set.
+    """
+
+    def __init__(
+        self, config: FieldConfig, seed: int = 0, isa: str = "auto", threads: int = 1
+    ) -> None:
+        reason = unavailable_reason(config)
+        if reason:
+            raise ConfigError(f"{reason}; set field.backend to 'torch'")
+        self.config = config
+        self.device = torch.device("cpu")
+        try:
+            self.fused = _kernel.FusedField(config.width, config.embedding, isa, threads)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        self.fused.set_parameters(FieldNetwork(config, seed).flat())
+
+    def evaluate(self, points: torch.Tensor) -> torch.Tensor:
+        """Values (N, 4) at points (N, 3); backward adds to the field's own gradients."""
+        anchor = torch.empty(0, requires_grad=True)
+        values: torch.Tensor = _Evaluation.apply(points, anchor, self.fused)  # type: ignore[no-untyped-call]
+        return values
+
+    def step(self, learning_rate: float) -> bool:
+        """One Adam step with the gradients since the last; False (and no step) if not finite."""
+        return self.fused.adam_step(learning_rate, *ADAM_BETAS, ADAM_EPSILON)
+
+    def predict(self, points: Floats) -> Floats:
+        """Values (N, 4) at points (N, 3) without gradients."""
+        return self.fused.forward(np.ascontiguousarray(points, dtype=np.float32))
+
+    def probe(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Values (N, 4), df/dpoint (N, 3) and dluma/dpoint (N, 3), for tracking."""
+        values, distance, luma = self.fused.forward_with_gradient(
+            np.ascontiguousarray(points, dtype=np.float32)
+        )
+        assert luma is not None
+        return values, distance, luma
+
+    def flat(self) -> Floats:
+        """Copy of the weights in the layout of `network.parameter_shapes`."""
+        return self.fused.parameters()
+
+    def load_flat(self, vector: Floats) -> None:
+        """Replace the weights and forget the optimiser's state.
+
+        Raises:
+            ValueError: the vector has another length or numbers that are not finite.
+        """
+        self.fused.set_parameters(np.ascontiguousarray(vector, dtype=np.float32))
+        self.fused.zero_gradients()
+        self.fused.reset_optimizer()
+
+
+class _Evaluation(torch.autograd.Function):
+    """Lets torch's graph end in the kernel.
+
+    The weights are no tensors: an empty `anchor` that requires a gradient makes torch call
+    backward also where the points require none.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: torch.Tensor, anchor: torch.Tensor, fused: _kernel.FusedField
+    ) -> torch.Tensor:
+        inputs = points.detach().contiguous().numpy()
+        ctx.inputs, ctx.fused = inputs, fused
+        return torch.from_numpy(fused.forward(inputs))
+
+    @staticmethod
+    def backward(ctx: Any, grad_values: torch.Tensor) -> tuple[torch.Tensor | None, None, None]:
+        gradient = ctx.fused.backward(
+            ctx.inputs, grad_values.contiguous().numpy(), ctx.needs_input_grad[0]
+        )
+        return (None if gradient is None else torch.from_numpy(gradient)), None, None

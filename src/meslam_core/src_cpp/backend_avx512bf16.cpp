@@ -1,0 +1,2 @@
+#include "backend.hpp"
+namespace meslam { const Backend* avx512bf16_backend() { return nullptr; } }

@@ -1,0 +1,205 @@
+// The Python module meslam_core.field._kernel. Arrays are checked here, once; below, sizes fit.
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <string>
+#include <utility>
+
+#include "cpu_features.hpp"
+#include "fused_field.hpp"
+
+namespace py = pybind11;
+
+namespace meslam {
+namespace {
+
+using Array = py::array_t<float>;
+
+std::string describe_shape(const py::array& array) {
+    std::string text = "(";
+    for (py::ssize_t axis = 0; axis < array.ndim(); ++axis) {
+        if (axis > 0) text += ", ";
+        text += std::to_string(array.shape(axis));
+    }
+    return text + ")";
+}
+
+void check_floats(const py::array& array, const char* name) {
+    if (!py::isinstance<py::array_t<float>>(array)) {
+        throw py::type_error(std::string(name) + " has dtype " +
+                             std::string(py::str(array.dtype())) + "; float32 is expected");
+    }
+    if (!(array.flags() & py::array::c_style)) {
+        throw py::value_error(std::string(name) +
+                              " is not C-contiguous; pass numpy.ascontiguousarray of it");
+    }
+}
+
+// The numbers of an array of shape (rows, columns); any number of rows where rows is negative.
+const float* matrix(const py::array& array, const char* name, py::ssize_t rows,
+                    py::ssize_t columns) {
+    check_floats(array, name);
+    if (array.ndim() != 2 || array.shape(1) != columns || (rows >= 0 && array.shape(0) != rows)) {
+        const std::string expected = rows < 0 ? "N" : std::to_string(rows);
+        throw py::value_error(std::string(name) + " has shape " + describe_shape(array) + "; (" +
+                              expected + ", " + std::to_string(columns) + ") is expected");
+    }
+    return static_cast<const float*>(array.data());
+}
+
+const float* flat(const py::array& array, const char* name, size_t count) {
+    check_floats(array, name);
+    if (array.ndim() != 1 || static_cast<size_t>(array.shape(0)) != count) {
+        throw py::value_error(std::string(name) + " has shape " + describe_shape(array) + "; (" +
+                              std::to_string(count) + ",) is expected");
+    }
+    return static_cast<const float*>(array.data());
+}
+
+Array new_matrix(size_t rows, py::ssize_t columns) {
+    return Array({static_cast<py::ssize_t>(rows), columns});
+}
+
+Array new_parameters(const FusedField& field) {
+    return Array(static_cast<py::ssize_t>(field.shape().parameters));
+}
+
+Array forward(FusedField& field, const py::array& points) {
+    const float* const from = matrix(points, "points", -1, 3);
+    const size_t count = static_cast<size_t>(points.shape(0));
+    Array values = new_matrix(count, 4);
+    float* const to = values.mutable_data();
+    const py::gil_scoped_release unlocked;
+    field.forward(from, count, to);
+    return values;
+}
+
+py::tuple forward_with_gradient(FusedField& field, const py::array& points, bool luma) {
+    const float* const from = matrix(points, "points", -1, 3);
+    const size_t count = static_cast<size_t>(points.shape(0));
+    Array values = new_matrix(count, 4);
+    Array grad_distance = new_matrix(count, 3);
+    py::object grad_luma = py::none();
+    float* luma_to = nullptr;
+    if (luma) {
+        Array array = new_matrix(count, 3);
+        luma_to = array.mutable_data();
+        grad_luma = array;
+    }
+    float* const values_to = values.mutable_data();
+    float* const distance_to = grad_distance.mutable_data();
+    {
+        const py::gil_scoped_release unlocked;
+        field.forward_with_gradient(from, count, values_to, distance_to, luma_to);
+    }
+    return py::make_tuple(values, grad_distance, grad_luma);
+}
+
+py::object backward(FusedField& field, const py::array& points, const py::array& grad_values,
+                    bool want_points) {
+    const float* const from = matrix(points, "points", -1, 3);
+    const size_t count = static_cast<size_t>(points.shape(0));
+    const float* const gradient = matrix(grad_values, "grad_values", points.shape(0), 4);
+    py::object result = py::none();
+    float* to = nullptr;
+    if (want_points) {
+        Array grad_points = new_matrix(count, 3);
+        to = grad_points.mutable_data();
+        result = grad_points;
+    }
+    const py::gil_scoped_release unlocked;
+    field.backward(from, count, gradient, to);
+    return result;
+}
+
+template <void (FusedField::*kGet)(float*)>
+Array get_flat(FusedField& field) {
+    Array array = new_parameters(field);
+    float* const to = array.mutable_data();
+    const py::gil_scoped_release unlocked;
+    (field.*kGet)(to);
+    return array;
+}
+
+Array parameters(FusedField& field) {
+    Array array = new_parameters(field);
+    float* const to = array.mutable_data();
+    const py::gil_scoped_release unlocked;
+    field.get_parameters(to);
+    return array;
+}
+
+void set_parameters(FusedField& field, const py::array& array) {
+    const float* const from = flat(array, "parameters", field.shape().parameters);
+    const py::gil_scoped_release unlocked;
+    field.set_parameters(from);
+}
+
+py::tuple optimizer_state(FusedField& field) {
+    Array first = new_parameters(field);
+    Array second = new_parameters(field);
+    float* const first_to = first.mutable_data();
+    float* const second_to = second.mutable_data();
+    long step = 0;
+    {
+        const py::gil_scoped_release unlocked;
+        field.get_optimizer(first_to, second_to, step);
+    }
+    return py::make_tuple(first, second, step);
+}
+
+void set_optimizer_state(FusedField& field, const py::array& first, const py::array& second,
+                         long step) {
+    const size_t count = field.shape().parameters;
+    const float* const first_from = flat(first, "first_moment", count);
+    const float* const second_from = flat(second, "second_moment", count);
+    const py::gil_scoped_release unlocked;
+    field.set_optimizer(first_from, second_from, step);
+}
+
+bool adam_step(FusedField& field, float learning_rate, float beta1, float beta2, float epsilon,
+               float encoding_scale) {
+    const py::gil_scoped_release unlocked;
+    return field.adam_step({learning_rate, beta1, beta2, epsilon, encoding_scale});
+}
+
+std::vector<std::string> available_isas() {
+    std::vector<std::string> names;
+    for (const Backend* backend : available_backends()) names.emplace_back(backend->name);
+    return names;
+}
+
+}  // namespace
+
+PYBIND11_MODULE(_kernel, module) {
+    module.doc() = "Fused evaluation and training of a region's neural field.";
+    module.def("available_isas", available_isas, "Instruction sets usable here, the best first.");
+    using Free = py::call_guard<py::gil_scoped_release>;
+    py::class_<FusedField>(module, "FusedField")
+        .def(py::init<int, int, const std::string&, int>(), py::arg("width"), py::arg("embedding"),
+             py::arg("isa") = "auto", py::arg("threads") = 1)
+        .def_property_readonly("width", [](const FusedField& f) { return f.shape().width; })
+        .def_property_readonly("embedding", [](const FusedField& f) { return f.shape().embedding; })
+        .def_property_readonly("isa", &FusedField::isa)
+        .def_property_readonly("threads", &FusedField::threads)
+        .def_property_readonly("parameter_count",
+                               [](const FusedField& f) { return f.shape().parameters; })
+        .def("parameters", parameters)
+        .def("set_parameters", set_parameters, py::arg("parameters"))
+        .def("gradients", get_flat<&FusedField::get_gradients>)
+        .def("zero_gradients", &FusedField::zero_gradients, Free())
+        .def("optimizer_state", optimizer_state)
+        .def("set_optimizer_state", set_optimizer_state, py::arg("first_moment"),
+             py::arg("second_moment"), py::arg("step"))
+        .def("reset_optimizer", &FusedField::reset_optimizer, Free())
+        .def("forward", forward, py::arg("points"))
+        .def("forward_with_gradient", forward_with_gradient, py::arg("points"),
+             py::arg("luma") = true)
+        .def("backward", backward, py::arg("points"), py::arg("grad_values"),
+             py::arg("want_points") = true)
+        .def("adam_step", adam_step, py::arg("learning_rate"), py::arg("beta1") = 0.9f,
+             py::arg("beta2") = 0.99f, py::arg("epsilon") = 1e-8f, py::arg("encoding_scale") = 1.0f);
+}
+
+}  // namespace meslam

@@ -1,0 +1,198 @@
+#include "fused_field.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+#include "cpu_features.hpp"
+
+namespace meslam {
+namespace {
+
+using Lock = std::lock_guard<std::mutex>;
+
+// Rec. 601 luma of the three colours after the sigmoid.
+constexpr float kLuma[3] = {0.299f, 0.587f, 0.114f};
+
+void copy(const float* from, size_t count, float* to) { std::copy(from, from + count, to); }
+
+}  // namespace
+
+FusedField::FusedField(int width, int embedding, const std::string& isa, int threads)
+    : backend_(find_backend(isa)), shape_(make_network_shape(width, embedding)), pool_(threads) {
+    if (threads < 1 || threads > 64) {
+        throw std::invalid_argument("threads is " + std::to_string(threads) +
+                                    "; it may be from 1 to 64");
+    }
+    parameters_ = AlignedArray<float>(shape_.parameters);
+    gradients_ = AlignedArray<float>(shape_.parameters);
+    first_moment_ = AlignedArray<float>(shape_.parameters);
+    second_moment_ = AlignedArray<float>(shape_.parameters);
+    packed_ = AlignedArray<char>(backend_->packed_bytes(shape_));
+    for (int i = 0; i < threads; ++i) {
+        workspaces_.emplace_back(backend_->workspace_bytes(shape_));
+        accumulators_.emplace_back(backend_->accumulator_floats(shape_));
+    }
+    backend_->pack(shape_, parameters_.data(), packed_.data());
+}
+
+void FusedField::get_parameters(float* to) const {
+    const Lock lock(mutex_);
+    copy(parameters_.data(), shape_.parameters, to);
+}
+
+void FusedField::set_parameters(const float* from) {
+    const Lock lock(mutex_);
+    if (!backend_->all_finite(from, shape_.parameters)) {
+        throw std::invalid_argument("the parameters contain numbers that are not finite");
+    }
+    copy(from, shape_.parameters, parameters_.data());
+    backend_->pack(shape_, parameters_.data(), packed_.data());
+}
+
+void FusedField::get_gradients(float* to) {
+    const Lock lock(mutex_);
+    collect_gradients();
+    copy(gradients_.data(), shape_.parameters, to);
+}
+
+void FusedField::zero_gradients() {
+    const Lock lock(mutex_);
+    collect_gradients();
+    std::fill_n(gradients_.data(), shape_.parameters, 0.0f);
+}
+
+void FusedField::get_optimizer(float* first_moment, float* second_moment, long& step) const {
+    const Lock lock(mutex_);
+    copy(first_moment_.data(), shape_.parameters, first_moment);
+    copy(second_moment_.data(), shape_.parameters, second_moment);
+    step = step_;
+}
+
+void FusedField::set_optimizer(const float* first_moment, const float* second_moment, long step) {
+    const Lock lock(mutex_);
+    if (step < 0) throw std::invalid_argument("the optimiser's step count is negative");
+    if (!backend_->all_finite(first_moment, shape_.parameters) ||
+        !backend_->all_finite(second_moment, shape_.parameters)) {
+        throw std::invalid_argument("the optimiser's moments contain numbers that are not finite");
+    }
+    copy(first_moment, shape_.parameters, first_moment_.data());
+    copy(second_moment, shape_.parameters, second_moment_.data());
+    step_ = step;
+}
+
+void FusedField::reset_optimizer() {
+    const Lock lock(mutex_);
+    std::fill_n(first_moment_.data(), shape_.parameters, 0.0f);
+    std::fill_n(second_moment_.data(), shape_.parameters, 0.0f);
+    step_ = 0;
+}
+
+// task(thread, first sample, samples). Each thread has a fixed range of blocks, so that the order
+// of its sums does not depend on timing.
+void FusedField::for_each_block(size_t count,
+                                const std::function<void(int, size_t, int)>& task) {
+    const size_t block = static_cast<size_t>(backend_->block);
+    const size_t blocks = (count + block - 1) / block;
+    const size_t threads = static_cast<size_t>(pool_.threads());
+    const auto work = [&](int thread) {
+        const size_t begin = blocks * thread / threads;
+        const size_t end = blocks * (thread + 1) / threads;
+        if (begin == end) return;
+        alignas(64) char saved_state[kSavedStateBytes];
+        backend_->enter(saved_state);
+        for (size_t i = begin; i < end; ++i) {
+            task(thread, i * block, static_cast<int>(std::min(block, count - i * block)));
+        }
+        backend_->leave(saved_state);
+    };
+    if (blocks < 2) {
+        work(static_cast<int>(threads) - 1);
+    } else {
+        pool_.run(work);
+    }
+}
+
+void FusedField::forward(const float* points, size_t count, float* values) {
+    const Lock lock(mutex_);
+    for_each_block(count, [&](int thread, size_t first, int samples) {
+        backend_->forward(shape_, packed_.data(), workspaces_[thread].data(), points + 3 * first,
+                          samples, Keep::kNothing, values + 4 * first);
+    });
+}
+
+void FusedField::forward_with_gradient(const float* points, size_t count, float* values,
+                                       float* grad_distance, float* grad_luma) {
+    const Lock lock(mutex_);
+    AlignedArray<float> seeds(8 * static_cast<size_t>(backend_->block));
+    float* const distance_seed = seeds.data();
+    float* const luma_seed = distance_seed + 4 * backend_->block;
+    for (int s = 0; s < backend_->block; ++s) {
+        distance_seed[4 * s] = 1.0f;
+        copy(kLuma, 3, luma_seed + 4 * s + 1);
+    }
+    for_each_block(count, [&](int thread, size_t first, int samples) {
+        void* const workspace = workspaces_[thread].data();
+        backend_->forward(shape_, packed_.data(), workspace, points + 3 * first, samples,
+                          Keep::kSlopes, values + 4 * first);
+        backend_->backward(shape_, packed_.data(), workspace, distance_seed, samples,
+                           grad_distance + 3 * first, nullptr);
+        if (grad_luma != nullptr) {
+            backend_->backward(shape_, packed_.data(), workspace, luma_seed, samples,
+                               grad_luma + 3 * first, nullptr);
+        }
+    });
+}
+
+void FusedField::backward(const float* points, size_t count, const float* grad_values,
+                          float* grad_points) {
+    const Lock lock(mutex_);
+    uncollected_ = true;
+    AlignedArray<float> values(4 * static_cast<size_t>(backend_->block * pool_.threads()));
+    for_each_block(count, [&](int thread, size_t first, int samples) {
+        void* const workspace = workspaces_[thread].data();
+        backend_->forward(shape_, packed_.data(), workspace, points + 3 * first, samples,
+                          Keep::kAll, values.data() + 4 * thread * backend_->block);
+        backend_->backward(shape_, packed_.data(), workspace, grad_values + 4 * first, samples,
+                           grad_points == nullptr ? nullptr : grad_points + 3 * first,
+                           accumulators_[thread].data());
+    });
+}
+
+void FusedField::collect_gradients() {
+    if (!uncollected_) return;
+    for (AlignedArray<float>& accumulator : accumulators_) {
+        backend_->collect(shape_, accumulator.data(), gradients_.data());
+    }
+    uncollected_ = false;
+}
+
+bool FusedField::adam_step(const AdamOptions& options) {
+    const Lock lock(mutex_);
+    collect_gradients();
+    const bool usable = backend_->all_finite(gradients_.data(), shape_.parameters);
+    if (usable) {
+        ++step_;
+        AdamSettings settings{};
+        settings.beta1 = options.beta1;
+        settings.beta2 = options.beta2;
+        settings.epsilon = options.epsilon;
+        settings.bias_correction1 =
+            static_cast<float>(1.0 - std::pow(static_cast<double>(options.beta1), step_));
+        settings.bias_correction2 =
+            static_cast<float>(1.0 - std::pow(static_cast<double>(options.beta2), step_));
+        const auto update = [&](size_t first, size_t last, float learning_rate) {
+            settings.learning_rate = learning_rate;
+            backend_->adam(settings, last - first, gradients_.data() + first,
+                           parameters_.data() + first, first_moment_.data() + first,
+                           second_moment_.data() + first);
+        };
+        update(0, shape_.weight1, options.learning_rate * options.encoding_scale);
+        update(shape_.weight1, shape_.parameters, options.learning_rate);
+        backend_->pack(shape_, parameters_.data(), packed_.data());
+    }
+    std::fill_n(gradients_.data(), shape_.parameters, 0.0f);
+    return usable;
+}
+
+}  // namespace meslam

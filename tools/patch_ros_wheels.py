@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy
 
 PYTHON_INCLUDE = re.compile(r"/opt/python/cp[^/;\"]+/include/python3\.\d+")
-NUMPY_INCLUDE = re.compile(r"/opt/python/cp[^/;\"]+/lib/python3\.\d+/site-packages/numpy/[\w/]*include")
+NUMPY_INCLUDE = re.compile(
+    r"/opt/python/cp[^/;\"]+/lib/python3\.\d+/site-packages/numpy/[\w/]*include"
+)
 
 
 def main() -> int:

@@ -170,7 +170,7 @@ $(fingerprint "${base_paths[@]}" config colcon.meta)"
 
 # One set-up at a time in a working tree.
 exec 9<"$ROOT"
-flock 9
+flock --nonblock 9 || { say "waiting for another set-up to end"; flock 9; }
 
 REBUILD=0
 [ "${1:-}" = --rebuild ] && REBUILD=1

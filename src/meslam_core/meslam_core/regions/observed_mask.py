@@ -21,17 +21,20 @@ class ObservedMask:
     """
 
     def __init__(self, half_extent_m: float, voxel_m: float) -> None:
-        self.voxel_m = float(voxel_m)
         count = 2 * int(np.ceil(half_extent_m / voxel_m))
-        self.half_extent_m = 0.5 * count * self.voxel_m
-        self.flags = np.zeros((count, count, count), np.uint8)
+        self._set(np.zeros((count, count, count), np.uint8), voxel_m)
 
     @classmethod
     def from_flags(cls, flags: NDArray[np.uint8], voxel_m: float) -> ObservedMask:
         """A mask from stored flags (n, n, n) with n even."""
-        mask = cls(0.5 * flags.shape[0] * voxel_m, voxel_m)
-        mask.flags = flags
+        mask = cls.__new__(cls)
+        mask._set(flags, voxel_m)
         return mask
+
+    def _set(self, flags: NDArray[np.uint8], voxel_m: float) -> None:
+        self.flags = flags
+        self.voxel_m = float(voxel_m)
+        self.half_extent_m = 0.5 * flags.shape[0] * self.voxel_m
 
     def _indices(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Flat voxel numbers (N,) and which points lie in the cube."""

@@ -54,7 +54,7 @@ class Setting:
     @property
     def path(self) -> str:
         """`section.name`, as in `--set` and in ROS parameters."""
-        return f"{self.section}.{self.name}"
+        return f"{self.section}.{self.name}" if self.section else self.name
 
     def checked(self, value: Any) -> int | float | bool | str:
         """`value` in the setting's type.
@@ -340,6 +340,15 @@ class MapConfig:
 
 
 @dataclass(frozen=True)
+class RuntimeConfig:
+    """How the computer is used."""
+
+    threads: int = setting(
+        1, "threads of one tensor operation on the CPU", minimum=1, maximum=256
+    )
+
+
+@dataclass(frozen=True)
 class MeslamConfig:
     """The whole configuration, one section a part of the system."""
 
@@ -351,6 +360,7 @@ class MeslamConfig:
     mapping: MappingConfig = MappingConfig()
     regions: RegionsConfig = RegionsConfig()
     map: MapConfig = MapConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Mapping[str, Any]]) -> MeslamConfig:

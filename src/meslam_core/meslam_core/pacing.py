@@ -1,0 +1,52 @@
+"""Frames at the pace at which they were recorded, as a camera would deliver them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+from meslam_core.frame import RgbdFrame
+
+
+class PacedFrames:
+    """Yields frames when they are due; of several that are due, only the newest.
+
+    That is what a live subscription with a queue of one does: whoever is slower than the camera
+    misses frames, and never works on an old one. The clock starts with the first frame.
+
+    Args:
+        frames: in the order of their stamps.
+        clock: seconds, monotonic.
+        sleep: waits for seconds.
+
+    Attributes:
+        skipped: how many frames were passed over so far.
+    """
+
+    def __init__(
+        self,
+        frames: Iterable[RgbdFrame],
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._frames = iter(frames)
+        self._clock = clock
+        self._sleep = sleep
+        self.skipped = 0
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        pending = next(self._frames, None)
+        if pending is None:
+            return
+        first_stamp_ns, started = pending.stamp_ns, self._clock()
+        while pending is not None:
+            wait_s = (pending.stamp_ns - first_stamp_ns) * 1e-9 - (self._clock() - started)
+            if wait_s > 0:
+                self._sleep(wait_s)
+            now_ns = first_stamp_ns + round((self._clock() - started) * 1e9)
+            following = next(self._frames, None)
+            while following is not None and following.stamp_ns <= now_ns:
+                pending, following = following, next(self._frames, None)
+                self.skipped += 1
+            yield pending
+            pending = following

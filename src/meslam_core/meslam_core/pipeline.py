@@ -1,0 +1,264 @@
+"""A recording from its first frame to its trajectory, map and report."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+import torch
+
+from meslam_core.config import MeslamConfig
+from meslam_core.errors import EvaluationError, FrameError, RecordingError
+from meslam_core.evaluation.report import truth_entries
+from meslam_core.odometry import make_odometry
+from meslam_core.pacing import PacedFrames
+from meslam_core.recordings.recording import Recording
+from meslam_core.results import MAP, ONLINE_TRAJECTORY, TRAJECTORY, ResultFolder
+from meslam_core.run_report import Tally, map_entries, run_environment
+from meslam_core.slam import FrameResult, Slam, TrackingState
+from meslam_core.trajectory import Trajectory, read_tum, write_tum
+
+
+class RunProgress(Protocol):
+    """Is told how a run goes on."""
+
+    def started(self, frames: int) -> None:
+        """`frames` frames are going to be offered."""
+        ...
+
+    def processed(self, offered: int, result: FrameResult) -> None:
+        """One more frame is done, the last of `offered` ones."""
+        ...
+
+    def stage(self, name: str) -> None:
+        """Another stage begins: "refining" or "writing"."""
+        ...
+
+
+class Silent:
+    """Progress that nobody follows."""
+
+    def started(self, frames: int) -> None:
+        """Nothing."""
+
+    def processed(self, offered: int, result: FrameResult) -> None:
+        """Nothing."""
+
+    def stage(self, name: str) -> None:
+        """Nothing."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a recording is run.
+
+    Attributes:
+        frames: which of the recording's pairs to use, as in a list; nothing negative.
+        realtime: offer frames at the recording's pace and skip those that come while an earlier
+            one is in work (see `PacedFrames`).
+        truth: poses in TUM format to compare with.
+        hand_eye: the truth is the pose of another sensor on the same mount; find its place too.
+        seed: of every random choice.
+    """
+
+    frames: slice = field(default_factory=lambda: slice(None))
+    realtime: bool = False
+    truth: Path | None = None
+    hand_eye: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What became of a run.
+
+    Attributes:
+        report: the content of `report.json`.
+        broke_off: why the recording ended early; empty when it did not.
+        interrupted: whether the user ended the run.
+        lost: whether tracking was lost at the end, or never started.
+        not_evaluated: why the given truth could not be compared with; empty when it was.
+    """
+
+    report: dict[str, Any]
+    broke_off: str
+    interrupted: bool
+    lost: bool
+    not_evaluated: str
+
+
+def run(
+    recording: Recording,
+    config: MeslamConfig,
+    out_dir: Path,
+    options: RunOptions | None = None,
+    progress: RunProgress | None = None,
+) -> RunOutcome:
+    """Track and map a recording, and write what came of it.
+
+    Writes `trajectory.txt` (refined) and `trajectory_online.txt` (TUM format, T_map_camera, one
+    line a tracked frame), `map.meslam/` and `report.json` into `out_dir`. A recording that breaks
+    off, or a user who interrupts (SIGINT, SIGTERM), still leaves the results of the frames before;
+    after any other error nothing of this run is left.
+
+    Args:
+        recording: open; it is not closed.
+        config: all numbers.
+        out_dir: made where it does not exist; results of an earlier run are replaced.
+        options: which frames, at which pace, compared with what.
+        progress: is told how the run goes on.
+
+    Raises:
+        OutputError: when `out_dir` cannot be written; known before the first frame.
+        EvaluationError: when the truth cannot be read; known before the first frame.
+        RecordingError, FrameError: when not a single frame can be read.
+    """
+    options, progress = options or RunOptions(), progress or Silent()
+    torch.set_num_threads(config.runtime.threads)
+    truth = None if options.truth is None else read_tum(options.truth)
+    with ResultFolder(out_dir) as results:
+        slam = Slam(config, options.seed)
+        loop = _Loop(recording, slam, options, progress)
+        loop.run()
+        progress.stage("writing")
+        refined = loop.tally.tracked(slam.trajectory())
+        online = loop.tally.tracked(slam.online_trajectory())
+        write_tum(results.incomplete(TRAJECTORY), refined)
+        write_tum(results.incomplete(ONLINE_TRAJECTORY), online)
+        report = loop.report() | {"map_bytes": _write_map(slam, results.incomplete(MAP))}
+        not_evaluated = ""
+        if truth is not None:
+            not_evaluated = _evaluate(refined, online, truth, options.hand_eye, report)
+        results.write_report(report | run_environment())
+        results.publish()
+    lost = slam.state not in (TrackingState.OK, TrackingState.DEGRADED)
+    return RunOutcome(report, loop.broke_off, loop.interrupted, lost, not_evaluated)
+
+
+class _Loop:
+    """The loop over the frames and what it finds out.
+
+    Attributes:
+        tally: of the processed frames.
+        broke_off: why the recording ended early; empty when it did not.
+        interrupted: whether the user ended the loop.
+        skipped: frames passed over to keep the recording's pace.
+        wall_s: time from before the first frame is read until the map is refined [s].
+    """
+
+    def __init__(
+        self, recording: Recording, slam: Slam, options: RunOptions, progress: RunProgress
+    ) -> None:
+        self.tally = Tally()
+        self.broke_off = ""
+        self.interrupted = False
+        self.skipped = 0
+        self.wall_s = 0.0
+        self._recording = recording
+        self._slam = slam
+        self._options = options
+        self._progress = progress
+
+    def run(self) -> None:
+        """Feed the frames, then refine the map unless the user is in a hurry."""
+        started = time.perf_counter()
+        try:
+            with _stop_request() as stop:
+                self._feed(stop)
+        except (RecordingError, FrameError) as error:
+            if not self.tally.frames:
+                raise
+            self.broke_off = str(error)
+        if not self.tally.frames:
+            raise RecordingError(
+                f"{self._recording.name}: the chosen frames are none of its "
+                f"{len(self._recording)} frames; choose others"
+            )
+        if not self.interrupted:
+            self._progress.stage("refining")
+            self._slam.finish()
+        self.wall_s = time.perf_counter() - started
+
+    def _feed(self, stop: threading.Event) -> None:
+        chosen, config = self._options.frames, self._slam.config
+        self._progress.started(len(range(*chosen.indices(len(self._recording)))))
+        odometry = make_odometry(config.odometry, config.sensor)
+        frames = self._recording.frames(chosen.start or 0, chosen.stop, chosen.step or 1)
+        paced = PacedFrames(frames) if self._options.realtime else None
+        for frame in frames if paced is None else paced:
+            started = time.perf_counter()
+            estimate = odometry.process(frame)
+            odometry_ms = (time.perf_counter() - started) * 1e3
+            result = self._slam.process(frame, estimate)
+            self.tally.add(result, odometry_ms)
+            self.skipped = 0 if paced is None else paced.skipped
+            self._progress.processed(self.tally.frames + self.skipped, result)
+            if stop.is_set():
+                self.interrupted = True
+                return
+
+    def report(self) -> dict[str, Any]:
+        """The entries of `report.json` that the loop knows."""
+        return {
+            **self.tally.entries(),
+            **map_entries(self._slam),
+            "frames_skipped": self.skipped,
+            "wall_s": self.wall_s,
+            "fps": self.tally.frames / self.wall_s,
+            "final_state": self._slam.state.name,
+            "broke_off": self.broke_off or None,
+            "interrupted": self.interrupted,
+            "recording": self._recording.name,
+            "camera": self._recording.camera.to_dict(),
+            "seed": self._options.seed,
+            "realtime": self._options.realtime,
+            "config": self._slam.config.to_mapping(),
+        }
+
+
+@contextmanager
+def _stop_request() -> Iterator[threading.Event]:
+    """An event that the first SIGINT or SIGTERM sets; the second one has its usual effect."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    usual: dict[int, Any] = {}
+
+    def restore() -> None:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+
+    def request(_: int, __: FrameType | None) -> None:
+        event.set()
+        restore()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        usual[number] = signal.signal(number, request)
+    try:
+        yield event
+    finally:
+        restore()
+
+
+def _write_map(slam: Slam, path: Path) -> int:
+    """Store the map and return its size [bytes]."""
+    return 0
+
+
+def _evaluate(
+    refined: Trajectory, online: Trajectory, truth: Trajectory, hand_eye: bool, report: dict[str, Any]
+) -> str:
+    """Add the errors against the truth to the report; why not, where they cannot be known."""
+    try:
+        report.update(truth_entries(refined, online, truth, hand_eye=hand_eye))
+    except EvaluationError as error:
+        return str(error)
+    return ""

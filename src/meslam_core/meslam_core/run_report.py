@@ -1,0 +1,128 @@
+"""What `report.json` says about a run."""
+
+from __future__ import annotations
+
+import platform
+import resource
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import meslam_core
+from meslam_core.regions.observed_mask import OBSERVED, ObservedMask
+from meslam_core.slam import FrameResult, Slam, TrackingState
+from meslam_core.trajectory import Trajectory
+
+
+@dataclass
+class Tally:
+    """What accumulates over the frames of a run."""
+
+    frames: int = 0
+    degraded: int = 0
+    tracked_stamps_ns: list[int] = field(default_factory=list)
+    first_stamp_ns: int = 0
+    last_stamp_ns: int = 0
+    odometry_ms: list[float] = field(default_factory=list)
+    tracking_ms: list[float] = field(default_factory=list)
+    mapping_ms: list[float] = field(default_factory=list)
+
+    def add(self, result: FrameResult, odometry_ms: float) -> None:
+        """Count one processed frame."""
+        if not self.frames:
+            self.first_stamp_ns = result.stamp_ns
+        self.frames += 1
+        self.last_stamp_ns = result.stamp_ns
+        self.degraded += result.state is TrackingState.DEGRADED
+        if is_tracked(result):
+            self.tracked_stamps_ns.append(result.stamp_ns)
+        self.odometry_ms.append(odometry_ms)
+        self.tracking_ms.append(result.tracking_ms)
+        self.mapping_ms.append(result.mapping_ms)
+
+    def entries(self) -> dict[str, Any]:
+        """What the report says about the frames."""
+        tracked = len(self.tracked_stamps_ns)
+        return {
+            "frames": self.frames,
+            "frames_tracked": tracked,
+            "frames_lost": self.frames - tracked,
+            "frames_degraded": self.degraded,
+            "sensor_s": (self.last_stamp_ns - self.first_stamp_ns) * 1e-9,
+            "stage_ms": {
+                "odometry": _spread(self.odometry_ms),
+                "tracking": _spread(self.tracking_ms),
+                "mapping": _spread(self.mapping_ms),
+            },
+        }
+
+    def tracked(self, trajectory: Trajectory) -> Trajectory:
+        """The poses of a trajectory that were measured, not extrapolated."""
+        kept = np.isin(trajectory.stamps_ns, np.array(self.tracked_stamps_ns, np.int64))
+        return trajectory.subset(np.flatnonzero(kept))
+
+
+def is_tracked(result: FrameResult) -> bool:
+    """Whether a frame's pose rests on a measurement: the map's, or at least the odometry's."""
+    if result.state is TrackingState.OK:
+        return True
+    measured = result.odometry is not None and result.odometry.valid
+    return result.state is TrackingState.DEGRADED and measured
+
+
+def map_entries(slam: Slam) -> dict[str, Any]:
+    """What the report says about the map."""
+    if slam.atlas is None:
+        return {"keyframes": 0, "regions": 0, "observed_volume_m3": 0.0}
+    return {
+        "keyframes": len(slam.keyframes),
+        "regions": len(slam.atlas.regions),
+        "observed_volume_m3": observed_volume_m3(slam),
+    }
+
+
+def observed_volume_m3(slam: Slam) -> float:
+    """Volume of the observed space; where masks overlap, the nearest region's voxels count."""
+    if slam.atlas is None:
+        return 0.0
+    regions = list(slam.atlas.regions.values())
+    centers = np.array([region.T_map_region[:3, 3] for region in regions])
+    volume = 0.0
+    for number, region in enumerate(regions):
+        positions = _observed_positions(region.mask) @ region.T_map_region[:3, :3].T
+        distances = [np.linalg.norm(positions + centers[number] - c, axis=1) for c in centers]
+        nearest = np.argmin(distances, axis=0) == number
+        volume += np.count_nonzero(nearest) * region.mask.voxel_m**3
+    return float(volume)
+
+
+def _observed_positions(mask: ObservedMask) -> NDArray[np.float64]:
+    """Centres (N, 3) of the observed voxels about the region's centre [m]."""
+    voxels = np.argwhere(mask.flags & OBSERVED)
+    return (voxels + 0.5) * mask.voxel_m - mask.half_extent_m
+
+
+def run_environment() -> dict[str, Any]:
+    """Versions of what computed the results, and the largest memory of the process."""
+    return {
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "versions": {
+            "meslam": meslam_core.__version__,
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+            "torch": str(torch.__version__),
+            "numpy": np.__version__,
+            "open3d": metadata.version("open3d-cpu"),
+        },
+    }
+
+
+def _spread(values: list[float]) -> dict[str, float | None]:
+    """Median and 95th percentile; None without values."""
+    if not values:
+        return {"median": None, "p95": None}
+    return {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}

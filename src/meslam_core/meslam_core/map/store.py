@@ -1,0 +1,328 @@
+"""Maps on disk: a folder with a manifest and one file a region, whole at every instant.
+
+Region files are named by their content and never overwritten; a save writes the new ones, makes
+them durable, replaces the manifest, and only then removes what the new manifest does not name.
+So a crash at any instant leaves the previous map or the new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import uuid
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from meslam_core.errors import MapError, OutputError
+from meslam_core.map import codec
+from meslam_core.map.files import (
+    TEMPORARY_SUFFIX,
+    cannot_write,
+    sync_folder,
+    write_atomically,
+)
+from meslam_core.map.manifest import (
+    MAX_MANIFEST_BYTES,
+    Manifest,
+    NewerMapError,
+    RegionEntry,
+    grid_of,
+    is_region_file,
+)
+from meslam_core.map.stored_region import StoredRegion
+from meslam_core.regions.grid import RegionGrid, RegionIndex
+
+MANIFEST = "manifest.json"
+QUARANTINE = "quarantine"
+READ_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class LoadedMap:
+    """A map read from a store.
+
+    Attributes:
+        map_id: identifies the map.
+        grid: the lattice of its regions.
+        regions: those that are intact.
+        nodes: of the pose graph.
+        warnings: one sentence for every damage found; empty for an intact map.
+    """
+
+    map_id: str
+    grid: RegionGrid
+    regions: list[StoredRegion]
+    nodes: tuple[dict[str, Any], ...] = ()
+    warnings: list[str] = field(default_factory=list)
+
+
+class MapStore:
+    """A map's folder.
+
+    Args:
+        path: of the folder, by custom `*.meslam`; it need not exist before a save.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._written: dict[tuple[RegionIndex, int, int, str], RegionEntry] = {}
+
+    def save(
+        self,
+        regions: Iterable[StoredRegion | bytes],
+        grid: RegionGrid,
+        map_id: str | None = None,
+        precision: str = "int8",
+        nodes: Iterable[dict[str, Any]] = (),
+    ) -> str:
+        """Make the folder hold exactly these regions; only changed ones are written.
+
+        Args:
+            regions: all regions of the map, live snapshots or already encoded.
+            grid: the lattice they lie on.
+            map_id: of the map; by default that of the map already there, else a new one.
+            precision: of snapshots' weights, as in `codec.encode`.
+            nodes: of the pose graph, as JSON objects.
+
+        Returns:
+            The map's id.
+
+        Raises:
+            OutputError: when the folder cannot be written, holds something else, or another
+                program is writing it. The previous map is then untouched.
+            MapError: when a region cannot be encoded, or two have the same place.
+        """
+        try:
+            with self._locked():
+                return self._save(regions, grid, map_id, precision, tuple(nodes))
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+
+    def load(self, recover: bool = False) -> LoadedMap:
+        """The map; damaged regions are left out and reported, nothing on disk is changed.
+
+        Where the manifest is damaged the map is put together from the region files, which
+        describe themselves.
+
+        Args:
+            recover: do the same where the manifest is missing (an interrupted first save).
+
+        Raises:
+            MapError: when there is no map, nothing of it can be read, or a newer program wrote it.
+        """
+        for _ in range(READ_ATTEMPTS):
+            data = self._read_manifest(recover)
+            loaded, vanished = self._load(data)
+            # A writer may have replaced the map between reading its manifest and its files.
+            if not vanished or self._read_manifest(recover) == data:
+                break
+        if not loaded.regions and loaded.warnings:
+            raise MapError(f"{self.path}: no region can be read: {loaded.warnings[0]}")
+        return loaded
+
+    def manifest(self) -> Manifest:
+        """The manifest alone; raises as `load`, also where it is damaged."""
+        data = self._read_manifest(recover=False)
+        return Manifest.from_bytes(data or b"", str(self.path / MANIFEST))
+
+    @property
+    def map_bytes(self) -> int:
+        """Size of the map on disk: its regions and the manifest."""
+        manifest = self.manifest()
+        return sum(e.bytes for e in manifest.regions) + (self.path / MANIFEST).stat().st_size
+
+    def _save(
+        self,
+        regions: Iterable[StoredRegion | bytes],
+        grid: RegionGrid,
+        map_id: str | None,
+        precision: str,
+        nodes: tuple[dict[str, Any], ...],
+    ) -> str:
+        previous = self._previous()
+        keep = {entry.file: entry for entry in previous.regions} if previous else {}
+        entries: dict[RegionIndex, RegionEntry] = {}
+        for region in regions:
+            entry, data = self._entry(region, precision, keep)
+            if entry.index in entries:
+                raise MapError(f"two regions have the place {entry.index}; a map has one each")
+            entries[entry.index] = entry
+            if data is not None and not self._holds(entry):
+                write_atomically(self.path / entry.file, data)
+        map_id = map_id or (previous.map_id if previous else uuid.uuid4().hex)
+        manifest = Manifest(map_id, grid, tuple(entries.values()), nodes)
+        write_atomically(self.path / MANIFEST, manifest.to_bytes())
+        self._clean(manifest, previous)
+        return map_id
+
+    def _entry(
+        self, region: StoredRegion | bytes, precision: str, keep: dict[str, RegionEntry]
+    ) -> tuple[RegionEntry, bytes | None]:
+        """A region's entry, and its bytes unless this store wrote the same version before."""
+        if isinstance(region, bytes):
+            decoded = codec.decode(region)
+            return RegionEntry.of(decoded.index, decoded.version, region), region
+        key = (region.index, region.version, region.stamp_ns, precision)
+        known = self._written.get(key)
+        if known is not None and known.file in keep and self._holds(known):
+            return known, None
+        data = codec.encode(region, precision)
+        entry = RegionEntry.of(region.index, region.version, data)
+        self._written[key] = entry
+        return entry, data
+
+    def _holds(self, entry: RegionEntry) -> bool:
+        """Whether a region's file is there with the right content."""
+        try:
+            data = (self.path / entry.file).read_bytes()
+        except OSError:
+            return False
+        return hashlib.sha256(data).hexdigest() == entry.sha256
+
+    def _previous(self) -> Manifest | None:
+        """The map already there.
+
+        Raises:
+            OutputError: when the folder holds something that is not ours to change.
+        """
+        try:
+            return self.manifest()
+        except NewerMapError as error:
+            raise OutputError(f"{error}; it is not overwritten") from error
+        except MapError:
+            foreign = [name for name in os.listdir(self.path) if not _is_ours(name)]
+            if foreign:
+                raise OutputError(
+                    f"{self.path} is no map and holds {foreign[0]}; choose another folder"
+                ) from None
+            return None
+
+    def _clean(self, manifest: Manifest, previous: Manifest | None) -> None:
+        """Remove what the new manifest does not name; damaged files go into quarantine."""
+        named = {entry.file for entry in manifest.regions}
+        checksums = {e.file: e for e in previous.regions} if previous else {}
+        for name in sorted(os.listdir(self.path)):
+            path = self.path / name
+            if name in named or not _is_ours(name) or name in (MANIFEST, QUARANTINE):
+                continue
+            # What cannot be removed now is removed by a later save.
+            with contextlib.suppress(OSError):
+                if name in checksums and not self._holds(checksums[name]):
+                    (self.path / QUARANTINE).mkdir(exist_ok=True)
+                    os.replace(path, self.path / QUARANTINE / name)
+                else:
+                    os.unlink(path)
+        sync_folder(self.path)
+
+    def _read_manifest(self, recover: bool) -> bytes | None:
+        """The manifest's bytes; None where it is missing and that is no obstacle."""
+        path = self.path / MANIFEST
+        try:
+            with open(path, "rb") as file:
+                return file.read(MAX_MANIFEST_BYTES + 1)
+        except FileNotFoundError:
+            if recover and self.path.is_dir():
+                return None
+            if not self.path.is_dir():
+                raise MapError(f"{self.path} does not exist or is no folder of a map") from None
+            raise MapError(
+                f"{self.path} holds no {MANIFEST}: it is no map, or its first save was "
+                "interrupted; what was written can be loaded with recovery"
+            ) from None
+        except OSError as error:
+            raise MapError(f"{path} cannot be read: {error.strerror}") from error
+
+    def _load(self, data: bytes | None) -> tuple[LoadedMap, bool]:
+        """The map of a manifest, and whether a file it names was not there."""
+        try:
+            manifest = Manifest.from_bytes(data or b"", str(self.path / MANIFEST))
+        except NewerMapError:
+            raise
+        except MapError as error:
+            return self._rebuilt(str(error)), False
+        loaded = LoadedMap(manifest.map_id, manifest.grid, [], manifest.nodes)
+        vanished = False
+        for entry in manifest.regions:
+            try:
+                loaded.regions.append(self._read_region(entry))
+            except FileNotFoundError:
+                vanished = True
+                loaded.warnings.append(f"{self.path / entry.file} is missing; region left out")
+            except (MapError, OSError) as error:
+                loaded.warnings.append(f"region {entry.index} left out: {error}")
+        return loaded, vanished
+
+    def _read_region(self, entry: RegionEntry) -> StoredRegion:
+        path = self.path / entry.file
+        data = _read_limited(path)
+        if hashlib.sha256(data).hexdigest() != entry.sha256:
+            raise MapError(f"{path}: the checksum does not match the manifest; it is damaged")
+        region = codec.decode(data, str(path))
+        if region.index != entry.index:
+            raise MapError(f"{path} holds region {region.index} instead of {entry.index}")
+        return region
+
+    def _rebuilt(self, reason: str) -> LoadedMap:
+        """The map as far as its region files tell it: the newest intact one of each place."""
+        newest: dict[RegionIndex, StoredRegion] = {}
+        warnings = [f"{reason}; the map is put together from its region files"]
+        for name in sorted(filter(is_region_file, os.listdir(self.path))):
+            try:
+                region = codec.decode(_read_limited(self.path / name), str(self.path / name))
+            except (MapError, OSError) as error:
+                warnings.append(f"left out: {error}")
+                continue
+            other = newest.get(region.index)
+            if other is None or (region.stamp_ns, region.version) > (other.stamp_ns, other.version):
+                newest[region.index] = region
+        if not newest:
+            raise MapError(f"{reason}; there is no intact region file to rebuild the map from")
+        regions = [newest[index] for index in sorted(newest)]
+        return LoadedMap(uuid.uuid4().hex, grid_of(regions), regions, (), warnings)
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """The folder, made where it is missing, with no other writer in it."""
+        created = not self.path.exists()
+        self.path.mkdir(parents=True, exist_ok=True)
+        if created:
+            sync_folder(self.path.parent)
+        descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+        except BlockingIOError as error:
+            raise OutputError(
+                f"{self.path} is being written by another program; wait until it is done"
+            ) from error
+        except BaseException:
+            if created:
+                self._remove_unfinished()
+            raise
+        finally:
+            os.close(descriptor)
+
+    def _remove_unfinished(self) -> None:
+        """Leave nothing behind of a first save that failed."""
+        with contextlib.suppress(OSError):
+            if (self.path / MANIFEST).exists():
+                return
+            for name in os.listdir(self.path):
+                if _is_ours(name):
+                    os.unlink(self.path / name)
+            os.rmdir(self.path)
+
+
+def _read_limited(path: Path) -> bytes:
+    """A region file's bytes, one more than the maximum at most."""
+    with open(path, "rb") as file:
+        return file.read(codec.MAX_FILE_BYTES + 1)
+
+
+def _is_ours(name: str) -> bool:
+    base = name.removesuffix(TEMPORARY_SUFFIX)
+    return base in (MANIFEST, QUARANTINE) or is_region_file(base)

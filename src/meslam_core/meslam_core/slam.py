@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from meslam_core.config import MeslamConfig
+from meslam_core.field import field_device
 from meslam_core.frame import RgbdFrame
 from meslam_core.mapping.joint_optimizer import JointOptimizer, StepLosses
 from meslam_core.mapping.keyframe_policy import KeyframePolicy
@@ -101,7 +102,7 @@ class Slam:
         self, config: MeslamConfig, seed: int = 0, T_map_camera: Pose = T_BODY_OPTICAL
     ) -> None:
         self.config = config
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.device = field_device(config.field)
         self.keyframes = KeyframeStore(config.keyframes.rays, self.device)
         self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
         self.tracker = FieldTracker(config.tracking)

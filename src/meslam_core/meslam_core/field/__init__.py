@@ -2,13 +2,42 @@
 
 from __future__ import annotations
 
+import functools
+import logging
+
 import torch
 
 from meslam_core.config import FieldConfig
+from meslam_core.field.kernel import KernelField, unavailable_reason
 from meslam_core.field.model import FieldModel, TorchField
+
+log = logging.getLogger(__name__)
+
+
+def field_device(config: FieldConfig) -> torch.device:
+    """Where fields of this configuration are computed: a GPU where torch sees one."""
+    if config.backend != "kernel" and torch.cuda.is_available():
+        return torch.device("cuda")
+    return torch.device("cpu")
 
 
 def make_field(config: FieldConfig, seed: int) -> FieldModel:
-    """A freshly initialised field on the backend that the configuration asks for."""
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    """A freshly initialised field on the backend that the configuration asks for.
+
+    Raises:
+        ConfigError: backend is 'kernel' and the compiled kernel cannot serve the configuration.
+    """
+    device = field_device(config)
+    if config.backend == "kernel":
+        return KernelField(config, seed)
+    if config.backend == "auto" and device.type == "cpu":
+        reason = unavailable_reason(config)
+        if not reason:
+            return KernelField(config, seed)
+        _say_once(f"{reason}; torch computes the field instead, several times slower")
     return TorchField(config, seed, device)
+
+
+@functools.cache
+def _say_once(message: str) -> None:
+    log.warning(message)

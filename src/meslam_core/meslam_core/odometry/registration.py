@@ -87,16 +87,19 @@ class HybridRegistrar:
             for n in HYBRID_ITERATIONS
         ]
 
-    def prepare(self, frame: RgbdFrame) -> tuple[Any, Any]:
+    def prepare(self, frame: RgbdFrame) -> tuple[Any, Any, float]:
         color, depth, camera = _reduced(frame, self._odometry, self._sensor)
         image = o3d.t.geometry.RGBDImage(
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color))),
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth))),
         )
-        return image, o3d.core.Tensor(camera.matrix)
+        return image, o3d.core.Tensor(camera.matrix), float(np.mean(depth > 0))
 
     def register(
-        self, source: tuple[Any, Any], target: tuple[Any, Any], T_target_source: Pose
+        self,
+        source: tuple[Any, Any, float],
+        target: tuple[Any, Any, float],
+        T_target_source: Pose,
     ) -> Registration:
         odometry = o3d.t.pipelines.odometry
         limit = self._odometry.max_distance_m
@@ -116,9 +119,9 @@ class HybridRegistrar:
             source[0].depth, target[0].depth, source[1], result.transformation, limit, 1.0,
             self._sensor.max_depth_m,
         )
-        return Registration(
-            transformation, information.numpy(), result.fitness, result.inlier_rmse
-        )
+        # Open3D counts correspondences among all pixels; a D435 measures only half of them.
+        fitness = min(1.0, result.fitness / max(source[2], 1e-3))
+        return Registration(transformation, information.numpy(), fitness, result.inlier_rmse)
 
 
 class ColoredIcpRegistrar:

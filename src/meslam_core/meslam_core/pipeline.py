@@ -17,6 +17,8 @@ import torch
 from meslam_core.config import MeslamConfig
 from meslam_core.errors import EvaluationError, FrameError, RecordingError
 from meslam_core.evaluation.report import truth_entries
+from meslam_core.map.store import MapStore
+from meslam_core.map.stored_region import snapshot
 from meslam_core.odometry import make_odometry
 from meslam_core.pacing import PacedFrames
 from meslam_core.recordings.recording import Recording
@@ -132,11 +134,13 @@ def run(
         online = loop.tally.tracked(slam.online_trajectory())
         write_tum(results.incomplete(TRAJECTORY), refined)
         write_tum(results.incomplete(ONLINE_TRAJECTORY), online)
-        report = loop.report() | {"map_bytes": _write_map(slam, results.incomplete(MAP))}
+        report = loop.report()
+        report["map_bytes"] = _write_map(slam, loop.tally.last_stamp_ns, results.incomplete(MAP))
         not_evaluated = ""
         if truth is not None:
             not_evaluated = _evaluate(refined, online, truth, options.hand_eye, report)
-        results.write_report(report | run_environment())
+        report.update(run_environment())
+        results.write_report(report)
         results.publish()
     lost = slam.state not in (TrackingState.OK, TrackingState.DEGRADED)
     return RunOutcome(report, loop.broke_off, loop.interrupted, lost, not_evaluated)
@@ -248,13 +252,27 @@ def _stop_request() -> Iterator[threading.Event]:
         restore()
 
 
-def _write_map(slam: Slam, path: Path) -> int:
-    """Store the map and return its size [bytes]."""
-    return 0
+def _write_map(slam: Slam, stamp_ns: int, path: Path) -> int:
+    """Store the map of all frames up to a stamp and return its size [bytes]."""
+    if slam.atlas is None:
+        return 0
+    active = slam.atlas.active
+    stored = []
+    for region in slam.atlas.regions.values():
+        trained = slam.keyframes.stamps_ns[max(region.keyframes)]
+        newest = stamp_ns if any(region is each for each in active) else trained
+        stored.append(snapshot(region, newest))
+    store = MapStore(path)
+    store.save(stored, slam.atlas.grid, precision=slam.config.map.codec)
+    return store.map_bytes
 
 
 def _evaluate(
-    refined: Trajectory, online: Trajectory, truth: Trajectory, hand_eye: bool, report: dict[str, Any]
+    refined: Trajectory,
+    online: Trajectory,
+    truth: Trajectory,
+    hand_eye: bool,
+    report: dict[str, Any],
 ) -> str:
     """Add the errors against the truth to the report; why not, where they cannot be known."""
     try:

@@ -11,12 +11,12 @@ from types import TracebackType
 from typing import Any
 
 from meslam_core.errors import OutputError
+from meslam_core.map.store import MANIFEST
 
 TRAJECTORY = "trajectory.txt"
 ONLINE_TRAJECTORY = "trajectory_online.txt"
 MAP = "map.meslam"
 REPORT = "report.json"
-MAP_MANIFEST = "manifest.json"
 
 
 class ResultFolder:
@@ -39,7 +39,7 @@ class ResultFolder:
 
     def __enter__(self) -> ResultFolder:
         occupied = self.path / MAP
-        if occupied.exists() and not (occupied / MAP_MANIFEST).is_file():
+        if occupied.exists() and not (occupied / MANIFEST).is_file():
             raise OutputError(
                 f"{occupied} exists and is not a map store; move it away or choose another folder"
             )

@@ -1,0 +1,392 @@
+"""The `meslam` command.
+
+Exit status: 0 when it worked, 2 for bad usage or input that cannot be read (in part: what could be
+read is used, and the rest is stated), 3 when tracking was lost and never recovered, 130 when the
+user interrupted a run. Messages go to standard error, results to standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from meslam_core import __version__
+from meslam_core.errors import ConfigError, MeslamError
+
+# Torch and Open3D take seconds to import, so every command imports what it needs itself.
+if TYPE_CHECKING:
+    import click
+
+    from meslam_core.camera import PinholeCamera
+    from meslam_core.map.neural_map import NeuralMap
+    from meslam_core.pipeline import RunOutcome
+
+BAD_INPUT = 2
+TRACKING_LOST = 3
+INTERRUPTED = 130
+
+NEXT_STEPS = """\
+MeSLAM maps a room with an RGB-D camera and keeps the map in small neural networks.
+
+  meslam run RECORDING --out DIR         track and map a recording
+  meslam mesh DIR/map.meslam --out room.ply
+  meslam info RECORDING_OR_MAP           what a recording or a map holds
+
+No recording at hand? Make one:
+  meslam simulate room --duration 20 --out room.mcap
+  meslam run room.mcap --out out --truth room_truth.txt
+
+`meslam --help` lists all commands, `meslam COMMAND --help` explains one.
+"""
+
+
+class _Commands(TyperGroup):
+    """Turns every error that a user can mend into one line and exit status 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except MeslamError as error:
+            _complain(str(error))
+            raise typer.Exit(BAD_INPUT) from error
+
+
+app = typer.Typer(
+    cls=_Commands,
+    help="Dense RGB-D SLAM whose map is a set of small neural networks.",
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode=None,
+    invoke_without_command=True,
+)
+
+
+def main() -> None:
+    """Entry point of the `meslam` command."""
+    app()
+
+
+@app.callback()
+def _start(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"meslam {__version__}")
+    elif context.invoked_subcommand is None:
+        typer.echo(NEXT_STEPS, nl=False)
+    else:
+        _show_warnings()
+
+
+CameraOption = Annotated[
+    Path | None,
+    typer.Option(help="camera.json with width, height, fx, fy, cx, cy instead of the recording's."),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; repeatable."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+LeverArmOption = Annotated[
+    bool,
+    typer.Option(
+        "--lever-arm",
+        help="The true poses are another sensor's on the same mount: find its place as well.",
+    ),
+]
+MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map store.")]
+
+
+@app.command()
+def run(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; made if missing.")],
+    camera: CameraOption = None,
+    preset: Annotated[str, typer.Option(help="Settings to start from.")] = "default",
+    overrides: SetOption = None,
+    frames: Annotated[
+        str, typer.Option(metavar="A:B[:STEP]", help="Use the frames A, A+STEP, ... below B.")
+    ] = ":",
+    realtime: Annotated[
+        bool,
+        typer.Option(
+            "--realtime",
+            help="Offer frames at the recording's pace; those that come while an earlier one is "
+            "in work are skipped, but for the newest.",
+        ),
+    ] = False,
+    truth: Annotated[
+        Path | None, typer.Option(help="True poses (TUM format) to compare with.")
+    ] = None,
+    lever_arm: LeverArmOption = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of every random choice.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Track and map a recording.
+
+    RECORDING is a rosbag2 folder, an .mcap, .db3 or .bag file, a TUM folder, or a folder with
+    color/, depth/ and camera.json. Writes trajectory.txt, trajectory_online.txt, map.meslam and
+    report.json.
+    """
+    from meslam_core.config import MeslamConfig
+
+    config = MeslamConfig.from_overrides(overrides or [], preset)
+    chosen = _frame_range(frames)
+    intrinsics = _camera(camera)
+    from meslam_core import pipeline
+    from meslam_core.console import RunBar, error_console
+    from meslam_core.recordings import open_recording
+
+    source = open_recording(recording, intrinsics)
+    options = pipeline.RunOptions(chosen, realtime, truth, lever_arm, seed)
+    try:
+        with RunBar(error_console()) as bar:
+            outcome = pipeline.run(source, config, out, options, bar)
+    finally:
+        source.close()
+    _print(outcome.report, as_json, _run_summary(outcome.report, out))
+    _exit_with(outcome, out)
+
+
+@app.command()
+def evaluate(
+    trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY.txt")],
+    truth: Annotated[Path, typer.Argument(metavar="POSES.txt")],
+    lever_arm: LeverArmOption = False,
+    tolerance: Annotated[
+        float, typer.Option(min=0.0, help="Largest difference of paired stamps [s].")
+    ] = 0.02,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare a trajectory with true poses, both in TUM format.
+
+    As the TUM benchmark does: paired by stamp, aligned by a rigid motion, RMSE of the rest.
+    """
+    from meslam_core.evaluation.report import trajectory_entries
+    from meslam_core.trajectory import read_tum
+
+    entries = trajectory_entries(
+        read_tum(trajectory), read_tum(truth), tolerance_s=tolerance, hand_eye=lever_arm
+    )
+    _print(entries, as_json)
+
+
+@app.command()
+def mesh(
+    stored: MapArgument,
+    out: Annotated[Path, typer.Option(metavar="FILE.ply", help="The mesh file.")],
+    resolution: Annotated[float, typer.Option(help="Spacing of the vertices [m].")] = 0.02,
+) -> None:
+    """Extract a map's coloured surface as a triangle mesh."""
+    from meslam_core.console import counting_bar, error_console
+    from meslam_core.map.mesh import extract_mesh
+    from meslam_core.map.mesh_file import write_mesh
+
+    neural_map, damaged = _load_map(stored)
+    with counting_bar(error_console(), "tiles") as progress:
+        surface = extract_mesh(neural_map, resolution, progress=progress)
+    write_mesh(surface, out)
+    typer.echo(f"{out}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles")
+    _exit_if_damaged(stored, damaged)
+
+
+@app.command()
+def query(
+    stored: MapArgument,
+    points: Annotated[Path, typer.Option(metavar="FILE.npy", help="(N, 3) floats, map frame [m].")],
+    out: Annotated[Path, typer.Option(metavar="FILE.npy", help="The answers, one a point.")],
+) -> None:
+    """Ask a map about points.
+
+    Writes a structured array (N,) with the fields occupancy (int8: -1 unknown, 0 free, 100
+    occupied), probability (float32, of being occupied; 0.5 where unknown), density (float32,
+    1/m; NaN where unknown), distance (float32, m: to the nearest surface, positive behind it; NaN
+    where unknown) and color (3 uint8, RGB; meaningful near surfaces, 0 where unknown).
+    """
+    from meslam_core.point_query import answer, read_points, write_answers
+
+    wanted = read_points(points)
+    neural_map, damaged = _load_map(stored)
+    write_answers(out, answer(neural_map, wanted))
+    typer.echo(f"{out}: {len(wanted)} answers")
+    _exit_if_damaged(stored, damaged)
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(metavar="RECORDING_OR_MAP")],
+    camera: CameraOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Tell what a recording or a map holds."""
+    if path.is_dir() and ((path / "manifest.json").exists() or path.suffix == ".meslam"):
+        from meslam_core.map_info import describe_map
+
+        facts, damaged = describe_map(path)
+        _print(facts, as_json)
+        _exit_if_damaged(path, damaged)
+        return
+    from meslam_core.recordings import describe, open_recording
+
+    recording = open_recording(path, _camera(camera))
+    try:
+        _print(describe(recording), as_json)
+    finally:
+        recording.close()
+
+
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A recording of any kind.")],
+    target: Annotated[Path, typer.Argument(metavar="TARGET.mcap")],
+    camera: CameraOption = None,
+) -> None:
+    """Convert a recording to an .mcap file with depth registered to colour."""
+    from meslam_core.console import counting_bar, error_console
+    from meslam_core.recordings import convert as write_frames
+    from meslam_core.recordings import open_recording
+
+    recording = open_recording(source, _camera(camera))
+    try:
+        with counting_bar(error_console(), "frames") as progress:
+            count = write_frames(recording, target, progress)
+    finally:
+        recording.close()
+    typer.echo(f"{target}: {count} frames")
+
+
+@app.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="The space to walk through.")],
+    duration: Annotated[float, typer.Option(help="Length of the recording [s].")],
+    out: Annotated[Path, typer.Option(metavar="FILE.mcap", help="The recording.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of path and noise.")] = 0,
+    fps: Annotated[float, typer.Option(help="Frames a second.")] = 15.0,
+) -> None:
+    """Record a simulated hand-held camera; the true poses go to FILE_truth.txt beside it."""
+    from meslam_core.console import counting_bar, error_console
+    from meslam_core.recordings import convert as write_frames
+    from meslam_core.simulation.simulator import simulate as simulated
+    from meslam_core.trajectory import write_tum
+
+    recording = simulated(scene, duration, seed, fps=fps)
+    with counting_bar(error_console(), "frames") as progress:
+        count = write_frames(recording, out, progress)
+    truth = out.with_name(f"{out.stem}_truth.txt")
+    write_tum(truth, recording.truth)
+    typer.echo(f"{out}: {count} frames; true poses in {truth}")
+
+
+def _frame_range(text: str) -> slice:
+    match = re.fullmatch(r"(\d*):(\d*)(?::(\d+))?", text.strip())
+    if match is None:
+        raise ConfigError(f"--frames {text!r} is not of the form A:B or A:B:STEP, as in 0:100:2")
+    start, stop, step = (int(part) if part else None for part in match.groups())
+    if step == 0 or (stop is not None and stop <= (start or 0)):
+        raise ConfigError(f"--frames {text!r} chooses nothing; A must be below B and STEP positive")
+    return slice(start, stop, step)
+
+
+def _camera(path: Path | None) -> PinholeCamera | None:
+    from meslam_core.camera import PinholeCamera
+
+    return None if path is None else PinholeCamera.from_json(path)
+
+
+def _load_map(path: Path) -> tuple[NeuralMap, list[str]]:
+    """A map and a sentence for every damage found."""
+    from meslam_core.map.neural_map import NeuralMap
+    from meslam_core.map.store import MapStore
+
+    loaded = MapStore(path).load()
+    return NeuralMap(loaded.regions), loaded.warnings
+
+
+def _exit_if_damaged(path: Path, damages: list[str]) -> None:
+    if damages:
+        for damage in damages:
+            _complain(damage)
+        _complain(f"{path} is damaged; the rest of the map was used. Restore it from a copy.")
+        raise typer.Exit(BAD_INPUT)
+
+
+def _exit_with(outcome: RunOutcome, out: Path) -> None:
+    """State what went wrong with a run that has results, and exit accordingly."""
+    frames, tracked = outcome.report["frames"], outcome.report["frames_tracked"]
+    status = 0
+    if outcome.interrupted:
+        _complain(f"interrupted after {frames} frames; the results so far are in {out}")
+        status = INTERRUPTED
+    if outcome.lost:
+        _complain(
+            f"tracking was lost and never recovered; {tracked} of {frames} frames were tracked, "
+            f"their results are in {out}. Move the camera more slowly, over surfaces within range"
+        )
+        status = TRACKING_LOST
+    if outcome.not_evaluated:
+        _complain(f"no comparison with the truth: {outcome.not_evaluated}")
+        status = BAD_INPUT
+    if outcome.broke_off:
+        _complain(
+            f"the recording breaks off: {outcome.broke_off}; the results of the {frames} frames "
+            f"before are in {out}"
+        )
+        status = BAD_INPUT
+    if status:
+        raise typer.Exit(status)
+
+
+def _run_summary(report: Mapping[str, Any], out: Path) -> str:
+    lines = [
+        f"{report['frames_tracked']} of {report['frames']} frames tracked, "
+        f"{report['keyframes']} keyframes, {report['fps']:.1f} frames/s",
+        f"map of {report['observed_volume_m3']:.1f} m^3 in {report['regions']} region(s), "
+        f"{report['map_bytes'] / 1000:.1f} kB",
+    ]
+    if "ate_rmse_m" in report:
+        lines.append(
+            f"ATE {report['ate_rmse_m'] * 100:.2f} cm, online "
+            f"{report['ate_online_rmse_m'] * 100:.2f} cm over {report['poses_compared']} poses"
+        )
+    lines.append(f"results in {out}")
+    return "\n".join(lines)
+
+
+def _print(entries: Mapping[str, Any], as_json: bool, text: str | None = None) -> None:
+    if as_json:
+        typer.echo(json.dumps(entries, indent=2, allow_nan=False))
+    elif text is not None:
+        typer.echo(text)
+    else:
+        for name, value in entries.items():
+            typer.echo(f"{name:<18} {_readable(value)}")
+
+
+def _readable(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_readable(item)}" for key, item in value.items()) or "-"
+    if isinstance(value, list | tuple):
+        return ", ".join(_readable(item) for item in value) or "-"
+    return "-" if value is None else str(value)
+
+
+def _complain(message: str) -> None:
+    typer.echo(f"meslam: {message}", err=True)
+
+
+def _show_warnings() -> None:
+    from meslam_core.console import ConsoleHandler
+
+    package = logging.getLogger("meslam_core")
+    package.handlers = [ConsoleHandler()]
+    package.propagate = False

@@ -22,8 +22,6 @@ from meslam_core.errors import ConfigError, MeslamError
 
 # Torch and Open3D take seconds to import, so every command imports what it needs itself.
 if TYPE_CHECKING:
-    import click
-
     from meslam_core.camera import PinholeCamera
     from meslam_core.map.neural_map import NeuralMap
     from meslam_core.pipeline import RunOutcome
@@ -41,7 +39,7 @@ MeSLAM maps a room with an RGB-D camera and keeps the map in small neural networ
 
 No recording at hand? Make one:
   meslam simulate room --duration 20 --out room.mcap
-  meslam run room.mcap --out out --truth room_truth.txt
+  meslam run room.mcap --out out --truth room.truth.txt
 
 `meslam --help` lists all commands, `meslam COMMAND --help` explains one.
 """
@@ -50,7 +48,7 @@ No recording at hand? Make one:
 class _Commands(TyperGroup):
     """Turns every error that a user can mend into one line and exit status 2."""
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except MeslamError as error:
@@ -110,7 +108,9 @@ def run(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING")],
     out: Annotated[Path, typer.Option(help="Folder for the results; made if missing.")],
     camera: CameraOption = None,
-    preset: Annotated[str, typer.Option(help="Settings to start from.")] = "default",
+    preset: Annotated[
+        str, typer.Option(help="Settings to start from: default, fine or paper.")
+    ] = "default",
     overrides: SetOption = None,
     frames: Annotated[
         str, typer.Option(metavar="A:B[:STEP]", help="Use the frames A, A+STEP, ... below B.")
@@ -271,18 +271,18 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Of path and noise.")] = 0,
     fps: Annotated[float, typer.Option(help="Frames a second.")] = 15.0,
 ) -> None:
-    """Record a simulated hand-held camera; the true poses go to FILE_truth.txt beside it."""
-    from meslam_core.console import counting_bar, error_console
-    from meslam_core.recordings import convert as write_frames
-    from meslam_core.simulation.simulator import simulate as simulated
-    from meslam_core.trajectory import write_tum
+    """Record a simulated hand-held camera, with the true poses and surface beside it.
 
-    recording = simulated(scene, duration, seed, fps=fps)
+    FILE.truth.txt holds the poses in TUM format, FILE.surface.ply the surface.
+    """
+    from meslam_core.console import counting_bar, error_console
+    from meslam_core.simulation.simulator import simulate as simulated
+    from meslam_core.simulation.writer import truth_path, write_simulation
+
+    simulation = simulated(scene, duration, seed, fps=fps)
     with counting_bar(error_console(), "frames") as progress:
-        count = write_frames(recording, out, progress)
-    truth = out.with_name(f"{out.stem}_truth.txt")
-    write_tum(truth, recording.truth)
-    typer.echo(f"{out}: {count} frames; true poses in {truth}")
+        write_simulation(simulation, out, progress)
+    typer.echo(f"{out}: {len(simulation)} frames; true poses in {truth_path(out)}")
 
 
 def _frame_range(text: str) -> slice:

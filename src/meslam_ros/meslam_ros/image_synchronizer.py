@@ -1,0 +1,115 @@
+"""Pairs colour with depth images by their stamps."""
+
+from __future__ import annotations
+
+import time
+from bisect import insort
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from sensor_msgs.msg import Image
+
+from meslam_ros.conversions import NANOSECONDS, stamp_ns
+
+MAX_WAITING = 30
+RESTART_S = 1.0
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """A colour and a depth image taken together.
+
+    Attributes:
+        stamp_ns: of the colour image, which stamps everything that follows from the pair [ns].
+        color, depth: the messages.
+        arrival_s: when the pair was complete, `time.monotonic` [s].
+    """
+
+    stamp_ns: int
+    color: Image
+    depth: Image
+    arrival_s: float
+
+
+class ImageSynchronizer:
+    """Collects images of two topics until each has its partner.
+
+    Equal and nearly equal stamps pair at once. Others pair with the nearest stamp within the
+    tolerance, once a later image shows that no nearer one comes. Pairs come out with increasing
+    stamps; when stamps jump back by more than a second, a recording began again, and so does this.
+
+    Args:
+        tolerance_s: largest difference of stamps [s].
+
+    Attributes:
+        dropped: counts of images that found no partner, by reason.
+    """
+
+    def __init__(self, tolerance_s: float) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._tolerance_ns = round(tolerance_s * NANOSECONDS)
+        # No camera is so fast that its next image would be nearer.
+        self._equal_ns = self._tolerance_ns // 4
+        self._color: list[tuple[int, Image]] = []
+        self._depth: list[tuple[int, Image]] = []
+        self._last_pair_ns: int | None = None
+
+    def add_color(self, message: Image) -> Iterator[ImagePair]:
+        """Take a colour image; yields the pairs that are complete now."""
+        return self._add(self._color, message, "colour image", 0)
+
+    def add_depth(self, message: Image) -> Iterator[ImagePair]:
+        """Take a depth image; yields the pairs that are complete now."""
+        return self._add(self._depth, message, "depth image", self._tolerance_ns)
+
+    def _add(
+        self, waiting: list[tuple[int, Image]], message: Image, name: str, lateness_ns: int
+    ) -> Iterator[ImagePair]:
+        stamp = stamp_ns(message.header.stamp)
+        self._notice_restart(stamp)
+        if self._last_pair_ns is not None and stamp <= self._last_pair_ns - lateness_ns:
+            self.dropped[f"{name} came too late"] += 1
+            return
+        insort(waiting, (stamp, message), key=lambda entry: entry[0])
+        if len(waiting) > MAX_WAITING:
+            waiting.pop(0)
+            self.dropped[f"{name} without partner"] += 1
+        while (pair := self._next_pair()) is not None:
+            yield pair
+
+    def _notice_restart(self, stamp: int) -> None:
+        last = self._last_pair_ns
+        if last is not None and stamp < last - RESTART_S * NANOSECONDS:
+            self._last_pair_ns = None
+            self._color.clear()
+            self._depth.clear()
+
+    def _next_pair(self) -> ImagePair | None:
+        """The earliest pair that no image still to come could improve."""
+        for place, (stamp, _) in enumerate(self._color):
+            nearest = min(
+                range(len(self._depth)),
+                key=lambda i: abs(self._depth[i][0] - stamp),
+                default=None,
+            )
+            if nearest is None:
+                return None
+            difference = abs(self._depth[nearest][0] - stamp)
+            certain = difference <= self._equal_ns or self._depth[-1][0] > stamp
+            if difference <= self._tolerance_ns and certain:
+                return self._take(place, nearest)
+            if not certain:
+                return None
+        return None
+
+    def _take(self, color_place: int, depth_place: int) -> ImagePair:
+        """Remove a pair, and what came before it without finding a partner."""
+        self.dropped["colour image without partner"] += color_place
+        self.dropped["depth image without partner"] += depth_place
+        stamp, color = self._color[color_place]
+        depth = self._depth[depth_place][1]
+        del self._color[: color_place + 1]
+        del self._depth[: depth_place + 1]
+        self._last_pair_ns = stamp
+        return ImagePair(stamp, color, depth, time.monotonic())

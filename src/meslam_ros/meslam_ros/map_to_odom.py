@@ -1,0 +1,69 @@
+"""The transform from map to odometry, corrected with every frame and sent in between (REP-105)."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+from rclpy.node import Node
+
+from meslam_core import se3
+from meslam_ros.conversions import NANOSECONDS
+from meslam_ros.rgbd_input import STEADY
+from meslam_ros.transforms import TransformBroadcaster
+
+MAX_AHEAD_S = 0.5
+
+
+class MapToOdom:
+    """Keeps and broadcasts T_map_odom.
+
+    Stamps continue those of the images, so that they fit the odometry's whatever clock the
+    camera or recording has.
+
+    Args:
+        node: that broadcasts.
+        map_frame, odom_frame: parent and child.
+        rate_hz: of repetition.
+    """
+
+    def __init__(self, node: Node, map_frame: str, odom_frame: str, rate_hz: float) -> None:
+        self._node = node
+        self._map_frame = map_frame
+        self._odom_frame = odom_frame
+        self._period_s = 1.0 / rate_hz
+        self._broadcaster = TransformBroadcaster(node)
+        self._lock = threading.Lock()
+        self.reset()
+        self._timer = node.create_timer(self._period_s, self._repeat, clock=STEADY)
+
+    def reset(self) -> None:
+        """Forget the correction; nothing is sent until the next one."""
+        with self._lock:
+            self._T_map_odom = np.eye(4)
+            self._stamp_ns: int | None = None
+            self._updated_s = 0.0
+
+    def update(self, stamp_ns: int, T_map_odom: se3.Pose | None) -> None:
+        """Take and send the correction as of an image; None keeps the one before."""
+        with self._lock:
+            if T_map_odom is not None:
+                self._T_map_odom = T_map_odom
+            self._stamp_ns, self._updated_s = stamp_ns, time.monotonic()
+            self._send(stamp_ns)
+
+    def _repeat(self) -> None:
+        with self._lock:
+            elapsed_s = time.monotonic() - self._updated_s
+            if self._stamp_ns is not None and elapsed_s >= 0.5 * self._period_s:
+                ahead_s = min(elapsed_s, MAX_AHEAD_S)
+                self._send(self._stamp_ns + round(ahead_s * NANOSECONDS))
+
+    def _send(self, stamp_ns: int) -> None:
+        self._broadcaster.send(self._T_map_odom, stamp_ns, self._map_frame, self._odom_frame)
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._node.destroy_timer(self._timer)
+        self._broadcaster.close()

@@ -1,0 +1,91 @@
+"""One map in the making: the pipeline, the camera's place on the base, and what was counted."""
+
+from __future__ import annotations
+
+import uuid
+from collections import Counter
+from collections.abc import Collection
+
+from meslam_core import se3
+from meslam_core.config import MeslamConfig
+from meslam_core.frame import RgbdFrame
+from meslam_core.odometry import OdometryEstimate
+from meslam_core.regions.grid import RegionIndex
+from meslam_core.regions.region import Region
+from meslam_core.slam import FrameResult, Slam, TrackingState
+from meslam_core.trajectory import Trajectory
+from meslam_ros.odometry_messages import first_base_pose
+from meslam_ros.transforms import CameraMount
+
+WITH_POSE = (TrackingState.OK, TrackingState.DEGRADED)
+
+
+class MappingSession:
+    """From an empty map to a reset. The map frame is where the first base was.
+
+    Args:
+        config: of the method.
+        seed: of every random choice.
+
+    Attributes:
+        map_id: identifies the map.
+        received, tracked: frames so far, and those with a pose.
+        discarded: frames that were not processed, by reason.
+        result: of the latest frame.
+    """
+
+    def __init__(self, config: MeslamConfig, seed: int) -> None:
+        self.map_id = uuid.uuid4().hex
+        self.received = 0
+        self.tracked = 0
+        self.discarded: Counter[str] = Counter()
+        self.result: FrameResult | None = None
+        self._config = config
+        self._seed = seed
+        self._slam: Slam | None = None
+        self._mount: CameraMount | None = None
+
+    def process(
+        self, frame: RgbdFrame, mount: CameraMount, odometry: OdometryEstimate | None
+    ) -> FrameResult:
+        """Track and map one frame."""
+        if self._slam is None:
+            T_map_camera = first_base_pose(mount) @ mount.T_base_optical
+            self._slam, self._mount = Slam(self._config, self._seed, T_map_camera), mount
+        self.received += 1
+        self.result = self._slam.process(frame, odometry)
+        self.tracked += self.has_pose
+        return self.result
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the latest frame has a pose that is worth publishing."""
+        return self.result is not None and self.result.state in WITH_POSE
+
+    @property
+    def T_camera_base(self) -> se3.Pose:
+        """Where the base is in the camera's frame, (4, 4) [m]."""
+        assert self._mount is not None
+        return se3.inverse(self._mount.T_base_optical)
+
+    @property
+    def regions(self) -> Collection[Region]:
+        """All regions; empty before the first frame with depth."""
+        atlas = self._slam.atlas if self._slam else None
+        return list(atlas.regions.values()) if atlas else []
+
+    @property
+    def working_region(self) -> RegionIndex:
+        """Lattice index of the region that is optimised with the pose."""
+        atlas = self._slam.atlas if self._slam else None
+        return atlas.working.index if atlas else (0, 0, 0)
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes."""
+        return len(self._slam.keyframes) if self._slam else 0
+
+    def trajectory(self) -> Trajectory:
+        """T_map_camera of all frames as it is known now."""
+        assert self._slam is not None
+        return self._slam.trajectory()

@@ -1,0 +1,201 @@
+"""What the nodes can be told beyond the method's own configuration; defaults stand only here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from meslam_core.config import setting
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """Coordinate frames (REP-105)."""
+
+    map_frame: str = setting("map", "frame that the map and /meslam/pose are given in")
+    odom_frame: str = setting("odom", "frame of the odometry, between the map and the base")
+    base_frame: str = setting(
+        "camera_link",
+        "frame of the robot; must be connected to the image's optical frame through /tf_static, "
+        "else the optical frame itself is the base; empty takes the optical frame",
+    )
+    transform_timeout_s: float = setting(
+        2.0,
+        "how long to wait for /tf_static to connect base and optical frame",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    )
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """Images and how they wait."""
+
+    sync_tolerance_s: float = setting(
+        0.02,
+        "colour and depth images whose stamps differ by more are no pair",
+        unit="s",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    queue_size: int = setting(
+        30,
+        "image pairs that may wait for processing; beyond, the oldest is dropped and counted",
+        minimum=1,
+        maximum=1000,
+    )
+    input_timeout_s: float = setting(
+        3.0,
+        "without images for this long, the node says what it waits for",
+        unit="s",
+        minimum=0.5,
+        maximum=3600.0,
+    )
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """Parameters of the tracking node alone."""
+
+    odometry_timeout_s: float = setting(
+        0.5,
+        "how long an image pair waits for its odometry before it is tracked without",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
+    )
+    transform_rate_hz: float = setting(
+        20.0,
+        "how often the transform from map to odometry is sent again",
+        unit="Hz",
+        minimum=1.0,
+        maximum=200.0,
+    )
+    model_period_s: float = setting(
+        1.0,
+        "a region that changes is published at most once in this time",
+        unit="s",
+        minimum=0.1,
+        maximum=60.0,
+    )
+    path_period_s: float = setting(
+        1.0,
+        "the refined path is published at most once in this time",
+        unit="s",
+        minimum=0.1,
+        maximum=60.0,
+    )
+    idle_s: float = setting(
+        1.0,
+        "when no image has come for this long, the final regions and path are published",
+        unit="s",
+        minimum=0.1,
+        maximum=60.0,
+    )
+    seed: int = setting(0, "of every random choice", minimum=0, maximum=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class MapServerSettings:
+    """Parameters of the map server alone; the limits bound what one request may cost."""
+
+    map_frame: str = FrameSettings.map_frame
+    export_folder: str = setting(
+        "meslam_exports", "export_map writes only below this folder; it is made when needed"
+    )
+    map_folder: str = setting(
+        "meslam_maps", "save_map and load_map use only folders below this one"
+    )
+    mesh_topic_resolution_m: float = setting(
+        0.05, "spacing of the mesh on the topic", unit="m", minimum=0.01, maximum=1.0
+    )
+    mesh_topic_period_s: float = setting(
+        5.0,
+        "a region's mesh on the topic is renewed at most once in this time; 0 switches it off",
+        unit="s",
+        minimum=0.0,
+        maximum=3600.0,
+    )
+    points_topic_spacing_m: float = setting(
+        0.05, "spacing of the points on the topic", unit="m", minimum=0.01, maximum=1.0
+    )
+    min_resolution_m: float = setting(
+        0.005, "finer meshes and grids are refused", unit="m", minimum=0.001, maximum=1.0
+    )
+    max_resolution_m: float = setting(
+        0.5, "coarser meshes and grids are refused", unit="m", minimum=0.01, maximum=10.0
+    )
+    max_points: int = setting(
+        2_000_000, "more points in one query are refused", minimum=1, maximum=100_000_000
+    )
+    max_cells: int = setting(
+        400_000_000,
+        "meshes and grids over more cells than this are refused",
+        minimum=1000,
+        maximum=100_000_000_000,
+    )
+    grid_resolution_m: float = setting(
+        0.05, "cell of the occupancy grid by default", unit="m", minimum=0.01, maximum=1.0
+    )
+    grid_min_height_m: float = setting(
+        -0.8,
+        "bottom of the layer that obstructs, map frame, by default",
+        unit="m",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    grid_max_height_m: float = setting(
+        0.8,
+        "top of the layer that obstructs, map frame, by default",
+        unit="m",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+
+
+@dataclass(frozen=True)
+class PlayerSettings:
+    """Parameters of the bag player."""
+
+    recording: str = setting("", "path of the recording; any format that `meslam info` reads")
+    rate: float = setting(
+        1.0,
+        "speed of playback; 0 sends an image pair when /meslam/status has answered earlier ones, "
+        "so that nothing is dropped however slow the computer is",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    window: int = setting(
+        2, "with rate 0: image pairs that may be under way", minimum=1, maximum=30
+    )
+    start: float = setting(
+        0.0, "where in the recording to start", unit="s", minimum=0.0, maximum=1e6
+    )
+    frames: int = setting(
+        0, "how many image pairs to play, 0 for all", minimum=0, maximum=2**31 - 1
+    )
+    step: int = setting(1, "play every n-th image pair", minimum=1, maximum=1000)
+    loop: bool = setting(False, "start again at the end")
+    clock: bool = setting(True, "publish the images' time on /clock")
+    subscribers: int = setting(
+        1,
+        "wait for so many subscribers on each image topic before the first image; 0 does not wait",
+        minimum=0,
+        maximum=100,
+    )
+    wait_timeout_s: float = setting(
+        60.0,
+        "give up when subscribers, or with rate 0 an answer, do not come within this time",
+        unit="s",
+        minimum=0.1,
+        maximum=3600.0,
+    )
+    depth_encoding: str = setting(
+        "16UC1",
+        "of the depth images: millimetres as a D435 sends, or metres",
+        choices=("16UC1", "32FC1"),
+    )
+    base_frame: str = setting(
+        "camera_link", "parent of the optical frame on /tf_static; empty sends no transform"
+    )
+    optical_frame: str = setting("camera_color_optical_frame", "frame of the images")

@@ -1,0 +1,183 @@
+"""Odometry estimates of the camera as nav_msgs/Odometry of the base, and back."""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_left, insort
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+
+from meslam_core import se3
+from meslam_core.odometry import OdometryEstimate
+from meslam_core.slam import T_BODY_OPTICAL
+from meslam_ros.conversions import NANOSECONDS, from_pose, stamp_ns, to_pose, to_stamp
+from meslam_ros.transforms import CameraMount
+
+UNKNOWN_VARIANCE = 9999.0
+"""Variance of an estimate that must not be trusted, as in rtabmap's odometry messages."""
+BUFFER_SIZE = 500
+MAX_GAP_NS = NANOSECONDS // 5
+
+
+def first_base_pose(mount: CameraMount) -> se3.Pose:
+    """Pose (4, 4) of the first base in the map and odometry frames: x forward, z up (REP-103)."""
+    return T_BODY_OPTICAL.copy() if mount.base_is_optical else np.eye(4)
+
+
+class BaseMotion:
+    """Turns the camera's odometry into the base's, with twist and growing covariance."""
+
+    def __init__(self, odom_frame: str) -> None:
+        self._odom_frame = odom_frame
+        self._last: tuple[int, se3.Pose] | None = None
+        self._covariance = np.zeros((6, 6))
+
+    def message(self, estimate: OdometryEstimate, mount: CameraMount) -> Odometry:
+        """The message of the next estimate.
+
+        The pose's covariance is in the odometry frame's axes about the base, the twist's in the
+        base's axes; both translation first. An invalid estimate has `UNKNOWN_VARIANCE` in both.
+        """
+        T_base_camera = mount.T_base_optical
+        T_odom_base = se3.orthonormalized(
+            first_base_pose(mount)
+            @ T_base_camera
+            @ estimate.T_odom_camera
+            @ se3.inverse(T_base_camera)
+        )
+        twist, elapsed_s = np.zeros(6), 1.0
+        motion_covariance = np.zeros((6, 6))
+        if self._last is not None:
+            last_ns, T_odom_last = self._last
+            elapsed_s = max((estimate.stamp_ns - last_ns) / NANOSECONDS, 1e-3)
+            twist = se3.log(se3.inverse(T_odom_last) @ T_odom_base) / elapsed_s
+            adjoint = se3.adjoint(T_base_camera)
+            motion_covariance = adjoint @ estimate.covariance @ adjoint.T
+            self._grow(T_odom_last, T_odom_base, motion_covariance)
+        self._last = estimate.stamp_ns, T_odom_base
+        message = Odometry(child_frame_id=mount.base_frame)
+        message.header.stamp = to_stamp(estimate.stamp_ns)
+        message.header.frame_id = self._odom_frame
+        message.pose.pose = to_pose(T_odom_base)
+        linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        linear.x, linear.y, linear.z = map(float, twist[:3])
+        angular.x, angular.y, angular.z = map(float, twist[3:])
+        unknown = np.eye(6) * UNKNOWN_VARIANCE
+        message.pose.covariance = _flat(self._covariance if estimate.valid else unknown)
+        message.twist.covariance = _flat(
+            motion_covariance / elapsed_s**2 if estimate.valid else unknown
+        )
+        return message
+
+    def _grow(
+        self, T_odom_last: se3.Pose, T_odom_base: se3.Pose, motion: NDArray[np.float64]
+    ) -> None:
+        """Add a motion's uncertainty: what was uncertain in rotation moves the base sideways."""
+        transport = np.eye(6)
+        transport[:3, 3:] = -se3.hat(T_odom_base[:3, 3] - T_odom_last[:3, 3])
+        axes = np.kron(np.eye(2), T_odom_base[:3, :3])
+        self._covariance = transport @ self._covariance @ transport.T + axes @ motion @ axes.T
+
+
+def _flat(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.ascontiguousarray(covariance, np.float64).reshape(36)
+
+
+class OdometryBuffer:
+    """Odometry messages by stamp, filled by the executor and waited for by the worker."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._messages: dict[int, Odometry] = {}
+        self._changed = threading.Condition()
+
+    def add(self, message: Odometry) -> None:
+        """Keep a message; the oldest ones are forgotten."""
+        stamp = stamp_ns(message.header.stamp)
+        with self._changed:
+            if self._stamps and stamp < self._stamps[-1] - NANOSECONDS:
+                self._stamps.clear()
+                self._messages.clear()
+            if stamp not in self._messages:
+                insort(self._stamps, stamp)
+            self._messages[stamp] = message
+            for old in self._stamps[:-BUFFER_SIZE]:
+                del self._messages[old]
+            del self._stamps[:-BUFFER_SIZE]
+            self._changed.notify_all()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        with self._changed:
+            self._stamps.clear()
+            self._messages.clear()
+
+    def wait(self, stamp: int, mount: CameraMount, timeout_s: float) -> OdometryEstimate | None:
+        """The camera's odometry at a stamp [ns].
+
+        Args:
+            stamp: of the image [ns].
+            mount: of the camera on the base whose odometry it is.
+            timeout_s: how long to wait for a message at or after the stamp [s].
+
+        Returns:
+            The message with this stamp, or one interpolated between its neighbours where those
+            are close; None when there is none in time.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: stamp in self._messages or (self._stamps and self._stamps[-1] > stamp),
+                timeout_s,
+            )
+            if stamp in self._messages:
+                return from_odometry(self._messages[stamp], mount)
+            place = bisect_left(self._stamps, stamp)
+            if not 0 < place < len(self._stamps):
+                return None
+            before, after = self._stamps[place - 1], self._stamps[place]
+            if after - before > MAX_GAP_NS:
+                return None
+            first, second = self._messages[before], self._messages[after]
+        return _interpolated(stamp, first, second, mount)
+
+
+def from_odometry(message: Odometry, mount: CameraMount) -> OdometryEstimate:
+    """The camera's estimate from an odometry message of the base.
+
+    Raises:
+        FrameError: when the pose is not finite.
+    """
+    T_base_camera = mount.T_base_optical
+    covariance = np.array(message.twist.covariance).reshape(6, 6)
+    reason = ""
+    if message.child_frame_id.lstrip("/") != mount.base_frame:
+        reason = f"the odometry is of {message.child_frame_id!r}, the base is {mount.base_frame!r}"
+    elif covariance[0, 0] >= UNKNOWN_VARIANCE:
+        reason = "the odometry says that it is not to be trusted"
+    return OdometryEstimate(
+        stamp_ns=stamp_ns(message.header.stamp),
+        T_odom_camera=from_pose(message.pose.pose) @ T_base_camera,
+        covariance=covariance,
+        fitness=float(not reason),
+        residual_m=0.0,
+        valid=not reason,
+        reason=reason,
+    )
+
+
+def _interpolated(
+    stamp: int, first: Odometry, second: Odometry, mount: CameraMount
+) -> OdometryEstimate:
+    before, after = from_odometry(first, mount), from_odometry(second, mount)
+    fraction = (stamp - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+    return OdometryEstimate(
+        stamp_ns=stamp,
+        T_odom_camera=se3.interpolate(before.T_odom_camera, after.T_odom_camera, fraction),
+        covariance=after.covariance,
+        fitness=after.fitness,
+        residual_m=0.0,
+        valid=before.valid and after.valid,
+        reason=before.reason or after.reason,
+    )

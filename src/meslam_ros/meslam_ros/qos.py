@@ -1,0 +1,107 @@
+"""Quality of service: what each kind of topic uses, and what its publisher offers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_sensor_data,
+)
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+STREAM = QoSProfile(depth=50)
+"""Reliable results a frame: poses, status, odometry."""
+
+
+def latched(depth: int = 1) -> QoSProfile:
+    """Reliable, and kept for those who come later."""
+    return QoSProfile(
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+def images(reliability: ReliabilityPolicy, depth: int = 10) -> QoSProfile:
+    """The profile of camera images with a given reliability."""
+    return QoSProfile(
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        durability=qos_profile_sensor_data.durability,
+        reliability=reliability,
+    )
+
+
+def matching_reliability(publishers: list[TopicEndpointInfo]) -> ReliabilityPolicy:
+    """Reliable when every publisher is: a reliable reader gets nothing from best effort."""
+    reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+    return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+
+
+def describe(publishers: list[TopicEndpointInfo]) -> str:
+    """Publishers of a topic for a message to people."""
+    if not publishers:
+        return "no publisher"
+    offers = sorted(
+        f"{p.node_name} ({p.qos_profile.reliability.name.lower().replace('_', ' ')})"
+        for p in publishers
+    )
+    return f"{len(offers)} publisher{'s' if len(offers) > 1 else ''}: {', '.join(offers)}"
+
+
+class MatchedSubscription:
+    """A subscription that begins when a publisher is there, with the publisher's reliability.
+
+    `update` is called regularly; it subscribes, and subscribes anew when the offer changes.
+
+    Attributes:
+        topic: full name, remapped.
+        received: number of messages so far.
+    """
+
+    def __init__(
+        self, node: Node, message_type: type, topic: str, callback: Callable[[Any], None]
+    ) -> None:
+        self.topic = node.resolve_topic_name(topic)
+        self.received = 0
+        self._node = node
+        self._type = message_type
+        self._callback = callback
+        self._subscription: Subscription | None = None
+        self._reliability: ReliabilityPolicy | None = None
+
+    @property
+    def publishers(self) -> list[TopicEndpointInfo]:
+        """Who publishes the topic now."""
+        return self._node.get_publishers_info_by_topic(self.topic)
+
+    def update(self) -> None:
+        """Follow the publishers that the graph shows."""
+        publishers = self.publishers
+        if not publishers:
+            return
+        reliability = matching_reliability(publishers)
+        if reliability != self._reliability:
+            self.close()
+            self._reliability = reliability
+            self._subscription = self._node.create_subscription(
+                self._type, self.topic, self._received, images(reliability)
+            )
+
+    def close(self) -> None:
+        """Stop listening; `update` starts again."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+        self._subscription = self._reliability = None
+
+    def _received(self, message: Any) -> None:
+        self.received += 1
+        self._callback(message)

@@ -1,0 +1,70 @@
+"""Regions as messages: their models, their catalogue."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from geometry_msgs.msg import Vector3
+
+from meslam_core.errors import MapError
+from meslam_core.map.codec import FORMAT, decode, encode
+from meslam_core.map.stored_region import StoredRegion
+from meslam_interfaces.msg import RegionModel
+from meslam_ros.conversions import byte_array, stamp_ns, to_pose, to_stamp
+
+MAX_MODEL_BYTES = 64 << 20
+
+
+def region_model(region: StoredRegion, map_id: str, map_frame: str, precision: str) -> RegionModel:
+    """A region's network as a message; `data` is exactly its file in the map store.
+
+    Raises:
+        MapError: when the region holds values that the format cannot.
+    """
+    data = encode(region, precision)
+    message = RegionModel(
+        map_id=map_id,
+        index=np.array(region.index, np.int32),
+        version=region.version,
+        pose=to_pose(region.T_map_region),
+        size_m=Vector3(x=region.side_m, y=region.side_m, z=region.side_m),
+        keyframes=region.keyframes,
+        observed_volume_m3=region.mask.observed_volume_m3,
+        format=FORMAT,
+        sha256=hashlib.sha256(data).hexdigest(),
+        data=byte_array(data),
+    )
+    message.header.stamp = to_stamp(region.stamp_ns)
+    message.header.frame_id = map_frame
+    return message
+
+
+def model_name(message: RegionModel) -> str:
+    """How a region model is called in messages to people."""
+    return f"region {list(map(int, message.index))} version {message.version}"
+
+
+def stored_region(message: RegionModel) -> StoredRegion:
+    """The region of a message, after every check.
+
+    Raises:
+        MapError: when it is damaged, of another format, or contradicts its own header.
+    """
+    name = model_name(message)
+    if message.format != FORMAT:
+        raise MapError(
+            f"{name} has the format {message.format!r}, this program reads {FORMAT!r}; "
+            "use the same MeSLAM on both computers"
+        )
+    if not 0 < len(message.data) <= MAX_MODEL_BYTES:
+        raise MapError(f"{name} has {len(message.data)} bytes, expected 1 to {MAX_MODEL_BYTES}")
+    data = bytes(message.data)
+    if hashlib.sha256(data).hexdigest() != message.sha256:
+        raise MapError(f"{name}: the checksum does not match; it was damaged on its way")
+    region = decode(data, name)
+    if region.index != tuple(message.index) or region.version != message.version:
+        raise MapError(f"{name} holds {region.index} version {region.version} inside")
+    if region.stamp_ns != stamp_ns(message.header.stamp):
+        raise MapError(f"{name}: the stamps inside and outside differ")
+    return region

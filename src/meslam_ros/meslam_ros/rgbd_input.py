@@ -1,0 +1,257 @@
+"""Images of a camera as a node takes them: subscribed, paired, converted and registered."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image
+
+from meslam_core.camera import PinholeCamera, register_depth_to_color
+from meslam_core.errors import FrameError
+from meslam_core.frame import RgbdFrame
+from meslam_core.recordings.lens import Lens
+from meslam_core.se3 import Pose
+from meslam_ros import topics
+from meslam_ros.conversions import camera_from_info, color_image, depth_image
+from meslam_ros.image_synchronizer import ImagePair, ImageSynchronizer
+from meslam_ros.node_settings import FrameSettings, InputSettings
+from meslam_ros.qos import MatchedSubscription, describe
+from meslam_ros.transforms import BaseFrame, CameraMount, StaticTransforms
+
+GRAPH_PERIOD_S = 0.2
+SAME_INTRINSICS_PX = 0.5
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+
+@dataclass(frozen=True)
+class _Calibration:
+    """What the pixels of one camera_info mean."""
+
+    camera: PinholeCamera
+    lens: Lens
+
+    @classmethod
+    def of(cls, message: CameraInfo, topic: str) -> _Calibration:
+        camera = camera_from_info(message, topic)
+        return cls(camera, Lens(camera, message.distortion_model, message.d))
+
+
+class RgbdInput:
+    """Colour, depth and camera_info topics of one camera.
+
+    The executor only pairs messages and hands them to `on_pair`; `frame` converts a pair in
+    whatever thread asks for it.
+
+    Args:
+        node: whose executor listens.
+        settings: tolerances and time-outs.
+        frames: names of the frames.
+        on_pair: called in the executor with every pair.
+
+    Attributes:
+        dropped: pairs that could not be converted, by reason.
+        pairs: number of pairs so far.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: InputSettings,
+        frames: FrameSettings,
+        on_pair: Callable[[ImagePair], None],
+    ) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.pairs = 0
+        self.transforms = StaticTransforms(node)
+        self._node = node
+        self._settings = settings
+        self._on_pair = on_pair
+        self._base = BaseFrame(
+            self.transforms, frames.base_frame, frames.transform_timeout_s, node.get_logger().warn
+        )
+        self._synchronizer = ImageSynchronizer(settings.sync_tolerance_s)
+        self._infos: dict[str, CameraInfo] = {}
+        self._calibrations: dict[str, tuple[CameraInfo, _Calibration]] = {}
+        self._color = MatchedSubscription(node, Image, topics.COLOR, self._take_color)
+        self._depth = MatchedSubscription(node, Image, topics.DEPTH, self._take_depth)
+        self._color_info = MatchedSubscription(
+            node, CameraInfo, topics.COLOR_INFO, lambda m: self._infos.__setitem__("color", m)
+        )
+        self._depth_info = MatchedSubscription(
+            node, CameraInfo, topics.DEPTH_INFO, lambda m: self._infos.__setitem__("depth", m)
+        )
+        self._subscriptions = (self._color, self._depth, self._color_info, self._depth_info)
+        self._last_pair_s = self._last_report_s = time.monotonic()
+        self._timer = node.create_timer(GRAPH_PERIOD_S, self._watch, clock=STEADY)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._node.destroy_timer(self._timer)
+        for subscription in self._subscriptions:
+            subscription.close()
+        self.transforms.close()
+
+    @property
+    def losses(self) -> Counter[str]:
+        """Images that were not used, by reason."""
+        return +(self._synchronizer.dropped + self.dropped)
+
+    def mount(self, pair: ImagePair) -> CameraMount | None:
+        """Where the pair's camera sits on the base; None while /tf_static may still tell.
+
+        Raises:
+            FrameError: when the images name no frame.
+        """
+        return self._base.resolve(pair.color.header.frame_id)
+
+    def frame(self, pair: ImagePair) -> RgbdFrame:
+        """A pair as the core wants it: pinhole images, depth registered to colour.
+
+        Raises:
+            FrameError: naming the topic and what is wrong with it.
+        """
+        color_info = self._calibration("color", self._color_info.topic)
+        color = color_image(pair.color, self._color.topic)
+        depth_m = depth_image(pair.depth, self._depth.topic)
+        camera = color_info.camera
+        if color.shape[:2] != (camera.height, camera.width):
+            raise FrameError(
+                f"{self._color.topic} has {color.shape[1]}x{color.shape[0]} images, its "
+                f"camera_info says {camera.width}x{camera.height}"
+            )
+        if self._is_registered(pair, depth_m.shape, camera):
+            depth_m = color_info.lens.undistort_depth(depth_m)
+        else:
+            depth_m = self._registered(pair, depth_m, camera)
+        return RgbdFrame(pair.stamp_ns, color_info.lens.undistort_color(color), depth_m, camera)
+
+    def _calibration(self, kind: str, topic: str) -> _Calibration:
+        message = self._infos.get(kind)
+        if message is None:
+            raise FrameError(
+                f"no camera_info has come on {topic} ({describe(self._publishers(topic))}); "
+                "the images cannot be used without intrinsics"
+            )
+        known = self._calibrations.get(kind)
+        if known is None or not _same_info(known[0], message):
+            known = message, _Calibration.of(message, topic)
+            self._calibrations[kind] = known
+        return known[1]
+
+    def _is_registered(
+        self, pair: ImagePair, shape: tuple[int, ...], camera: PinholeCamera
+    ) -> bool:
+        if pair.depth.header.frame_id != pair.color.header.frame_id:
+            return False
+        if shape != (camera.height, camera.width):
+            return False
+        info = self._infos.get("depth")
+        return (
+            info is None
+            or not any(info.k)
+            or bool(np.allclose(info.k, camera.matrix.reshape(-1), atol=SAME_INTRINSICS_PX))
+        )
+
+    def _registered(
+        self, pair: ImagePair, depth_m: np.ndarray, camera: PinholeCamera
+    ) -> np.ndarray:
+        if "depth" not in self._infos:
+            raise FrameError(
+                f"{self._depth.topic} has {depth_m.shape[1]}x{depth_m.shape[0]} images in the "
+                f"frame {pair.depth.header.frame_id!r}, colour is {camera.width}x{camera.height} "
+                f"in {pair.color.header.frame_id!r}, and no camera_info on "
+                f"{self._depth_info.topic} tells how to register them; start the camera with "
+                "align_depth.enable:=true, or publish it"
+            )
+        depth_info = self._calibration("depth", self._depth_info.topic)
+        if depth_m.shape != (depth_info.camera.height, depth_info.camera.width):
+            raise FrameError(
+                f"{self._depth.topic} has {depth_m.shape[1]}x{depth_m.shape[0]} images, its "
+                f"camera_info says {depth_info.camera.width}x{depth_info.camera.height}"
+            )
+        return register_depth_to_color(
+            depth_info.lens.undistort_depth(depth_m),
+            depth_info.camera,
+            camera,
+            self._extrinsics(pair),
+        )
+
+    def _extrinsics(self, pair: ImagePair) -> Pose:
+        color_frame, depth_frame = pair.color.header.frame_id, pair.depth.header.frame_id
+        if color_frame == depth_frame:
+            return np.eye(4)
+        T_color_depth = self.transforms.lookup(color_frame, depth_frame)
+        if T_color_depth is None:
+            raise FrameError(
+                f"depth is in the frame {depth_frame!r}, colour in {color_frame!r}, and "
+                "/tf_static does not connect them; publish the transform, or start the camera "
+                "with align_depth.enable:=true"
+            )
+        return T_color_depth
+
+    def _take_color(self, message: Image) -> None:
+        for pair in self._synchronizer.add_color(message):
+            self._hand_over(pair)
+
+    def _take_depth(self, message: Image) -> None:
+        for pair in self._synchronizer.add_depth(message):
+            self._hand_over(pair)
+
+    def _hand_over(self, pair: ImagePair) -> None:
+        self.pairs += 1
+        self._last_pair_s = time.monotonic()
+        self._on_pair(pair)
+
+    def _watch(self) -> None:
+        for subscription in self._subscriptions:
+            subscription.update()
+        now = time.monotonic()
+        timeout_s = self._settings.input_timeout_s
+        if now - max(self._last_pair_s, self._last_report_s) >= timeout_s:
+            self._last_report_s = now
+            self._node.get_logger().warn(self.waiting_for(now - self._last_pair_s))
+
+    def waiting_for(self, silence_s: float) -> str:
+        """What is missing, for people: topics, publishers and the likely cause."""
+        lines = [f"no image pair for {silence_s:.0f} s; waiting for:"]
+        for subscription in self._subscriptions[:3]:
+            lines.append(
+                f"  {subscription.topic}: {describe(subscription.publishers)}, "
+                f"{subscription.received} messages"
+            )
+        lines.append(f"  likely cause: {self._likely_cause()}")
+        return "\n".join(lines)
+
+    def _likely_cause(self) -> str:
+        silent = [s.topic for s in self._subscriptions[:3] if not s.publishers]
+        if len(silent) == 3:
+            return "the camera or player is not running, or its topics have other names (remap)"
+        if silent:
+            return f"nobody publishes {', '.join(silent)}: another name (remap), or not enabled"
+        mute = [s.topic for s in self._subscriptions[:2] if not s.received]
+        if mute:
+            return f"{', '.join(mute)}: announced but nothing arrives; is the camera paused?"
+        if self.pairs == 0:
+            return (
+                "colour and depth stamps differ by more than sync_tolerance_s = "
+                f"{self._settings.sync_tolerance_s}"
+            )
+        return "the camera or player has paused or ended"
+
+    def _publishers(self, topic: str) -> list:
+        return self._node.get_publishers_info_by_topic(topic)
+
+
+def _same_info(first: CameraInfo, second: CameraInfo) -> bool:
+    return (
+        (first.width, first.height) == (second.width, second.height)
+        and np.array_equal(first.k, second.k)
+        and np.array_equal(first.d, second.d)
+        and first.distortion_model == second.distortion_model
+    )

@@ -1,0 +1,36 @@
+"""Names of all topics and services, relative so that a namespace moves them; remap the others."""
+
+from __future__ import annotations
+
+COLOR = "camera/camera/color/image_raw"
+DEPTH = "camera/camera/aligned_depth_to_color/image_raw"
+COLOR_INFO = "camera/camera/color/camera_info"
+DEPTH_INFO = "camera/camera/aligned_depth_to_color/camera_info"
+
+TF = "/tf"
+TF_STATIC = "/tf_static"
+CLOCK = "/clock"
+DIAGNOSTICS = "/diagnostics"
+
+ODOMETRY = "meslam/odom"
+POSE = "meslam/pose"
+POSE_WITH_COVARIANCE = "meslam/pose_with_covariance"
+PATH = "meslam/path"
+STATUS = "meslam/status"
+REGION_MODELS = "meslam/region_models"
+REGIONS = "meslam/regions"
+REGION_MARKERS = "meslam/region_markers"
+MESH = "meslam/mesh"
+MAP_POINTS = "meslam/map_points"
+OCCUPANCY_GRID = "meslam/occupancy_grid"
+
+RESET = "meslam/reset"
+PAUSE = "meslam/pause"
+EXPORT_MAP = "meslam/export_map"
+GET_MESH = "meslam/get_mesh"
+QUERY_OCCUPANCY = "meslam/query_occupancy"
+GET_OCCUPANCY_GRID = "meslam/get_occupancy_grid"
+SAVE_MAP = "meslam/save_map"
+LOAD_MAP = "meslam/load_map"
+LIST_REGIONS = "meslam/list_regions"
+PLAYER_PAUSE = "~/pause"

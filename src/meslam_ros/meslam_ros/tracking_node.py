@@ -1,0 +1,242 @@
+"""`tracking_node`: images and odometry to the pose in the map and the regions' networks."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import torch
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path
+from std_srvs.srv import SetBool, Trigger
+
+from meslam_core import se3
+from meslam_core.config import MeslamConfig
+from meslam_core.frame import RgbdFrame
+from meslam_core.odometry import OdometryEstimate
+from meslam_core.slam import TrackingState
+from meslam_interfaces.msg import TrackingStatus
+from meslam_ros import topics
+from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
+from meslam_ros.frame_worker import WARNING_PERIOD_S, FrameWorker
+from meslam_ros.image_synchronizer import ImagePair
+from meslam_ros.managed_node import ManagedNode, run
+from meslam_ros.map_to_odom import MapToOdom
+from meslam_ros.mapping_session import MappingSession
+from meslam_ros.model_publisher import ModelPublisher
+from meslam_ros.node_settings import FrameSettings, InputSettings, TrackingSettings
+from meslam_ros.odometry_messages import OdometryBuffer
+from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.qos import STREAM, latched
+from meslam_ros.rgbd_input import STEADY
+from meslam_ros.tracking_messages import (
+    covariance_message,
+    header,
+    path_message,
+    pose_message,
+    status_message,
+)
+from meslam_ros.transforms import CameraMount
+
+# Building a path takes a time that grows with its length; it may take this share of all time.
+PATH_SHARE = 0.03
+LEVELS = {TrackingState.OK: OK, TrackingState.LOST: ERROR}
+
+
+class TrackingNode(ManagedNode):
+    """Runs the pipeline in a worker of its own; the executor only takes messages and answers."""
+
+    def __init__(self) -> None:
+        super().__init__("tracking_node")
+        self._frames = declare_settings(self, FrameSettings)
+        self._inputs = declare_settings(self, InputSettings)
+        self._settings = declare_settings(self, TrackingSettings)
+        self._config = declare_config(self, MeslamConfig().to_mapping())
+        torch.set_num_threads(self._config.runtime.threads)
+
+    def configure(self) -> None:
+        frames, settings = self._frames, self._settings
+        self._pose = self.create_publisher(PoseStamped, topics.POSE, STREAM)
+        self._covariance = self.create_publisher(
+            PoseWithCovarianceStamped, topics.POSE_WITH_COVARIANCE, STREAM
+        )
+        self._path = self.create_publisher(Path, topics.PATH, latched())
+        self._status = self.create_publisher(TrackingStatus, topics.STATUS, STREAM)
+        self._diagnostics = Diagnostics(self)
+        self._models = ModelPublisher(
+            self, frames.map_frame, self._config.map.codec, settings.model_period_s
+        )
+        self._map_to_odom = MapToOdom(
+            self, frames.map_frame, frames.odom_frame, settings.transform_rate_hz
+        )
+        self._odometry = OdometryBuffer()
+        self._odometry_subscription = self.create_subscription(
+            Odometry, topics.ODOMETRY, self._odometry.add, STREAM
+        )
+        self._reset = self.create_service(Trigger, topics.RESET, self._on_reset)
+        self._pause = self.create_service(SetBool, topics.PAUSE, self._on_pause)
+        self._paused = False
+        self._reset_requested = False
+        self._begin()
+
+    def activate(self) -> None:
+        self._worker = FrameWorker(self, self._inputs, self._frames, self)
+        self._timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
+
+    def deactivate(self) -> None:
+        self.destroy_timer(self._timer)
+        self._worker.close()
+
+    def cleanup(self) -> None:
+        self._models.close()
+        self._map_to_odom.close()
+        self._diagnostics.close()
+        self.destroy_subscription(self._odometry_subscription)
+        for service in (self._reset, self._pause):
+            self.destroy_service(service)
+        for publisher in (self._pose, self._covariance, self._path, self._status):
+            self.destroy_publisher(publisher)
+
+    def _begin(self) -> None:
+        """Start with an empty map."""
+        self._session = MappingSession(self._config, self._settings.seed)
+        self._reset_requested = False
+        self._all_published = True
+        self._path_due_s = 0.0
+        self._models.begin(self._session.map_id)
+        self._map_to_odom.reset()
+
+    def restart(self, reason: str) -> None:
+        """Begin a new map (`FrameConsumer`)."""
+        self.get_logger().warn(f"{reason}; a new map begins")
+        self._begin()
+
+    def process(self, frame: RgbdFrame, mount: CameraMount, pair: ImagePair) -> None:
+        """Track, map and publish one frame (`FrameConsumer`)."""
+        if self._reset_requested:
+            self._begin()
+        session = self._session
+        if self._paused:
+            session.discarded["paused"] += 1
+            return
+        odometry = self._odometry_of(frame, mount)
+        result = session.process(frame, mount, odometry)
+        head = header(frame.stamp_ns, self._frames.map_frame)
+        if session.has_pose:
+            T_map_base = result.T_map_camera @ session.T_camera_base
+            self._pose.publish(pose_message(T_map_base, head))
+            self._covariance.publish(
+                covariance_message(T_map_base, result.covariance, result.T_map_camera, head)
+            )
+            T_map_odom = None
+            if odometry is not None:
+                T_map_odom = result.T_map_camera @ se3.inverse(odometry.T_odom_camera)
+            self._map_to_odom.update(frame.stamp_ns, T_map_odom)
+        self._publish_status(pair)
+        self._all_published = False
+        self._models.offer(session.regions, frame.stamp_ns)
+        if time.monotonic() >= self._path_due_s:
+            self._publish_path()
+
+    def idle(self, silence_s: float) -> None:
+        """Publish what the bounded rates held back (`FrameConsumer`)."""
+        if self._reset_requested:
+            self._begin()
+        if self._all_published or silence_s < self._settings.idle_s:
+            return
+        self._all_published = True
+        assert self._session.result is not None
+        self._models.offer(self._session.regions, self._session.result.stamp_ns, final=True)
+        self._publish_path()
+
+    def _odometry_of(self, frame: RgbdFrame, mount: CameraMount) -> OdometryEstimate | None:
+        if not self.count_publishers(self._odometry_subscription.topic_name):
+            self.get_logger().warn(
+                f"nobody publishes {self._odometry_subscription.topic_name}: tracking without "
+                "odometry",
+                throttle_duration_sec=10 * WARNING_PERIOD_S,
+            )
+            return None
+        odometry = self._odometry.wait(frame.stamp_ns, mount, self._settings.odometry_timeout_s)
+        if odometry is None:
+            self.get_logger().warn(
+                f"no odometry came for the image at {frame.stamp_s:.3f} s: tracked without",
+                throttle_duration_sec=WARNING_PERIOD_S,
+            )
+        return odometry
+
+    def _publish_status(self, pair: ImagePair) -> None:
+        session = self._session
+        assert session.result is not None
+        status = status_message(session.result, header(pair.stamp_ns, self._frames.map_frame))
+        dropped = self._worker.dropped + session.discarded
+        status.map_id = session.map_id
+        status.keyframes = session.keyframes
+        status.working_region = session.working_region
+        status.map_bytes = self._models.map_bytes
+        status.latency_s = time.monotonic() - pair.arrival_s
+        status.frames_tracked = session.tracked
+        status.frames_dropped = dropped.total()
+        status.frames_received = session.received + dropped.total()
+        status.drop_reasons = counts(dropped)
+        status.queue_length = self._worker.waiting
+        status.paused = self._paused
+        self._status.publish(status)
+
+    def _publish_path(self) -> None:
+        started = time.monotonic()
+        path = path_message(
+            self._session.trajectory(), self._session.T_camera_base, self._frames.map_frame
+        )
+        self._path.publish(path)
+        ended = time.monotonic()
+        self._path_due_s = ended + max(self._settings.path_period_s, (ended - started) / PATH_SHARE)
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._reset_requested = True
+        response.success = True
+        response.message = "the map is forgotten; a new one begins with the next image"
+        self.get_logger().info(response.message)
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._paused = request.data
+        response.success = True
+        response.message = "paused: images are discarded" if request.data else "going on"
+        self.get_logger().info(response.message)
+        return response
+
+    def _diagnose(self) -> None:
+        session, worker = self._session, self._worker
+        result, dropped = session.result, counts(worker.dropped + session.discarded)
+        level, message = STALE, "no images yet"
+        if result is not None:
+            level = LEVELS.get(result.state, WARN)
+            message = result.reason or result.state.name
+        if dropped and level in (OK, STALE):
+            level = WARN if result else ERROR
+            message = f"images were not used: {dropped}"
+        self._diagnostics.report(
+            level,
+            message,
+            {
+                "state": result.state.name if result else "INITIALISING",
+                "frames_tracked": session.tracked,
+                "dropped": dropped or "none",
+                "queue_length": worker.waiting,
+                "keyframes": session.keyframes,
+                "regions": len(session.regions),
+                "tracking_ms": round(result.tracking_ms, 1) if result else 0.0,
+                "mapping_ms": round(result.mapping_ms, 1) if result else 0.0,
+                "map_bytes": self._models.map_bytes,
+            },
+        )
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(TrackingNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,2 +1,27 @@
+// Bfloat16 by AMX tiles.
 #include "backend.hpp"
-namespace meslam { const Backend* amx_backend() { return nullptr; } }
+
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#pragma GCC target("amx-tile,amx-bf16,avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma")
+#define MESLAM_USE_TILES
+#define MESLAM_BLOCK 64
+#include "bf16_backend.hpp"
+
+namespace meslam {
+
+const Backend* amx_backend() {
+    static constexpr Backend backend = make_bf16_backend("amx");
+    return &backend;
+}
+
+}  // namespace meslam
+
+#else
+
+namespace meslam {
+
+const Backend* amx_backend() { return nullptr; }
+
+}  // namespace meslam
+
+#endif

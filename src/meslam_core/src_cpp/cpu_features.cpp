@@ -1,5 +1,6 @@
 #include "cpu_features.hpp"
 
+#include <algorithm>
 #include <cstdint>
 #include <cstdlib>
 #include <stdexcept>
@@ -20,6 +21,8 @@ struct CpuFeatures {
     bool avx512 = false;
     bool avx512bf16 = false;
     bool amx = false;
+    // AMD multiplies bfloat16 pairs at twice the rate of single precision, Intel at half of it.
+    bool fast_pairs = false;
 };
 
 #if defined(__x86_64__)
@@ -28,6 +31,12 @@ uint64_t enabled_register_states() {
     uint32_t low, high;
     __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
     return (static_cast<uint64_t>(high) << 32) | low;
+}
+
+bool made_by_amd() {
+    uint32_t a, b, c, d;
+    constexpr uint32_t kAuth = 0x68747541;  // the first letters of AuthenticAMD
+    return __get_cpuid(0, &a, &b, &c, &d) && b == kAuth;
 }
 
 // Linux hands the tile registers out on request only.
@@ -58,6 +67,7 @@ CpuFeatures detect() {
         found.avx2 && all(0xe6) && (features_b & kFoundationDqBwVl) == kFoundationDqBwVl;
     if (!found.avx512 || !__get_cpuid_count(7, 1, &a, &b, &c, &d)) return found;
     found.avx512bf16 = a & (1u << 5);
+    found.fast_pairs = made_by_amd();
     constexpr uint32_t kTilesAndBf16 = (1u << 24) | (1u << 22);
     found.amx = found.avx512bf16 && (features_d & kTilesAndBf16) == kTilesAndBf16 &&
                 all(0x60000) && request_tile_registers();
@@ -88,7 +98,7 @@ std::vector<const Backend*> available_backends() {
         bool supported;
         const Backend* backend;
     };
-    const Candidate best_first[] = {
+    const Candidate candidates[] = {
         {"amx", cpu.amx, amx_backend()},
         {"avx512bf16", cpu.avx512bf16, avx512bf16_backend()},
         {"avx512", cpu.avx512, avx512_backend()},
@@ -99,7 +109,7 @@ std::vector<const Backend*> available_backends() {
     const std::string cap = variable == nullptr ? "" : variable;
     bool reached = cap.empty() || cap == "auto";
     std::vector<const Backend*> available;
-    for (const Candidate& candidate : best_first) {
+    for (const Candidate& candidate : candidates) {
         reached = reached || cap == candidate.name;
         if (reached && candidate.supported && candidate.backend != nullptr) {
             available.push_back(candidate.backend);
@@ -108,6 +118,11 @@ std::vector<const Backend*> available_backends() {
     if (!reached) {
         throw std::invalid_argument(std::string(kCapVariable) + " is '" + cap +
                                     "'; it may be auto, amx, avx512bf16, avx512, avx2 or portable");
+    }
+    // A cap that names the slow pairs asks for them.
+    if (!cpu.fast_pairs && cap != "avx512bf16") {
+        const auto pairs = std::find(available.begin(), available.end(), avx512bf16_backend());
+        if (pairs != available.end()) std::iter_swap(pairs, pairs + 1);
     }
     return available;
 }

@@ -2,6 +2,7 @@
 // MESLAM_TILE_VECTORS, selects the instruction set and includes this.
 #pragma once
 
+#include "arena.hpp"
 #include "backend.hpp"
 #include "float_products.hpp"
 #include "optimizer_steps.hpp"
@@ -14,17 +15,6 @@ constexpr int kBlock = 64;
 constexpr float kInversePi = 0.318309886f;
 // Rows of a power-of-two length would fall on the same few cache sets.
 constexpr int kRowPadding = 16;
-
-// Hands out consecutive 64-byte aligned arrays; with a null start it only counts.
-struct Arena {
-    char* next;
-    template <class T = float>
-    T* take(size_t count) {
-        T* const start = reinterpret_cast<T*>(next);
-        next += (count * sizeof(T) + 63) / 64 * 64;
-        return start;
-    }
-};
 
 struct PackedWeights {
     float* frequency;      // (3,E) divided by pi

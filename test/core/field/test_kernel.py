@@ -19,9 +19,10 @@ if not ISAS:
 
 EMBEDDING = 96
 SINGLE_PRECISION = {"avx512", "avx2", "portable"}
-# Root mean square error over the root mean square of the exact values: single precision to the
-# 1e-4 that is asked of it; bfloat16, with 8 bits, to what three to nine rounded layers leave.
-TOLERANCE = {isa: 1e-4 if isa in SINGLE_PRECISION else 3e-2 for isa in ISAS}
+# Root mean square error over the root mean square of the exact numbers. With bfloat16's 8 bits a
+# ReLU near its kink switches, so gradients differ by several percent whoever computes them.
+VALUE_TOLERANCE = {isa: 1e-4 if isa in SINGLE_PRECISION else 0.01 for isa in ISAS}
+GRADIENT_TOLERANCE = {isa: 1e-4 if isa in SINGLE_PRECISION else 0.15 for isa in ISAS}
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -70,6 +71,28 @@ class Reference:
     def values(self, points: Floats) -> Doubles:
         return self.layers(torch.tensor(points, dtype=torch.float64))[0].detach().numpy()
 
+    def rounded(self, points: Floats, grad_values: Floats) -> tuple[Doubles, Doubles, Doubles]:
+        """Values and gradients as torch computes them with bfloat16 products."""
+        flat = self.flat.detach().float().requires_grad_(True)
+        sizes = [part.numel() for part in self.parts]
+        shapes = [part.shape for part in self.parts]
+        B, phi, *layers = [
+            part.view(shape) for part, shape in zip(flat.split(sizes), shapes, strict=True)
+        ]
+        inputs = torch.tensor(points, requires_grad=True)
+        embedded = torch.sin(inputs @ B.T + phi)
+        hidden = embedded
+        with torch.autocast("cpu", torch.bfloat16):
+            for layer in range(4):
+                if layer == 2:
+                    hidden = torch.cat([hidden, embedded], dim=1)
+                hidden = torch.relu(torch.nn.functional.linear(hidden, *layers[2 * layer :][:2]))
+            output = torch.nn.functional.linear(hidden, *layers[8:]).float()
+        values = torch.cat([output[:, :1], torch.sigmoid(output[:, 1:])], dim=1)
+        seeds = torch.tensor(grad_values)
+        gradients = torch.autograd.grad((values * seeds).sum(), [flat, inputs])
+        return values.detach().numpy(), gradients[0].numpy(), gradients[1].numpy()
+
     def gradients(self, points: Floats, grad_values: Floats) -> tuple[Doubles, Doubles]:
         """Gradients with respect to the parameters and the points."""
         inputs = torch.tensor(points, dtype=torch.float64, requires_grad=True)
@@ -90,8 +113,10 @@ def random_points(count: int, seed: int = 1) -> Floats:
 
 
 def smooth_points(reference: Reference, count: int, isa: str) -> Floats:
-    """Points whose gradient is defined in single precision; for bfloat16 any: its rounding
-    crosses kinks everywhere, and the tolerance covers that."""
+    """Points whose gradient is defined in the precision of an instruction set.
+
+    For bfloat16 any: its rounding crosses kinks everywhere, and the tolerance covers that.
+    """
     if isa not in SINGLE_PRECISION:
         return random_points(count)
     points = reference.smooth(random_points(2 * count + 20), margin=2e-5)
@@ -116,9 +141,15 @@ def fused_field(isa: str, parameters: Floats, width: int, threads: int = 1, embe
     return field
 
 
+def by_parameter(flat: NDArray, width: int) -> list[NDArray]:
+    """A flat vector cut into B, phi, W1, b1, ..."""
+    sizes = [int(np.prod(shape)) for shape in parameter_shapes(width, EMBEDDING).values()]
+    return np.split(flat, np.cumsum(sizes)[:-1])
+
+
 @pytest.mark.parametrize("width", kernel.WIDTHS)
-@pytest.mark.parametrize("isa", ISAS)
-def test_values_and_gradients_agree_with_float64(isa: str, width: int) -> None:
+@pytest.mark.parametrize("isa", [isa for isa in ISAS if isa in SINGLE_PRECISION])
+def test_single_precision_agrees_with_float64(isa: str, width: int) -> None:
     for seed in range(2):
         parameters = random_parameters(width, seed=seed)
         reference = Reference(parameters, width)
@@ -128,13 +159,42 @@ def test_values_and_gradients_agree_with_float64(isa: str, width: int) -> None:
         values = field.forward(points)
         points_gradient = field.backward(points, seeds)
         exact_parameters, exact_points = reference.gradients(points, seeds)
-        assert error(values, reference.values(points)) < TOLERANCE[isa]
-        assert error(points_gradient, exact_points) < 5 * TOLERANCE[isa]
-        sizes = [int(np.prod(s)) for s in parameter_shapes(width, EMBEDDING).values()]
-        cuts = np.cumsum(sizes)[:-1]
-        parts = np.split(field.gradients(), cuts), np.split(exact_parameters, cuts)
-        for actual, exact in zip(*parts, strict=True):
-            assert error(actual, exact) < 5 * TOLERANCE[isa]
+        assert error(values, reference.values(points)) < 1e-4
+        assert error(points_gradient, exact_points) < 1e-4
+        pairs = zip(
+            by_parameter(field.gradients(), width),
+            by_parameter(exact_parameters, width),
+            strict=True,
+        )
+        for actual, exact in pairs:
+            assert error(actual, exact) < 1e-4
+
+
+@pytest.mark.parametrize("width", kernel.WIDTHS)
+@pytest.mark.parametrize("isa", [isa for isa in ISAS if isa not in SINGLE_PRECISION])
+def test_bfloat16_is_as_close_to_float64_as_torchs(isa: str, width: int) -> None:
+    for seed in range(2):
+        parameters = random_parameters(width, seed=seed)
+        reference = Reference(parameters, width)
+        points = random_points(500)
+        seeds = seeds_for(points)
+        exact_parameters, exact_points = reference.gradients(points, seeds)
+        values, parameters_gradient, points_gradient = reference.rounded(points, seeds)
+        field = fused_field(isa, parameters, width)
+
+        def close(actual: NDArray, of_torch: NDArray, exact: NDArray) -> bool:
+            return error(actual, exact) < 1.4 * error(of_torch, exact) + 1e-6
+
+        assert close(field.forward(points), values, reference.values(points))
+        assert close(field.backward(points, seeds), points_gradient, exact_points)
+        triples = zip(
+            by_parameter(field.gradients(), width),
+            by_parameter(parameters_gradient, width),
+            by_parameter(exact_parameters, width),
+            strict=True,
+        )
+        for actual, of_torch, exact in triples:
+            assert close(actual, of_torch, exact)
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -147,8 +207,8 @@ def test_spatial_gradients_of_distance_and_luma(isa: str) -> None:
     distance_seed = np.tile(np.float32([1, 0, 0, 0]), (len(points), 1))
     luma_seed = np.tile(np.float32([0, *LUMA]), (len(points), 1))
     np.testing.assert_array_equal(values, field.forward(points))
-    assert error(distance, reference.gradients(points, distance_seed)[1]) < 5 * TOLERANCE[isa]
-    assert error(luma, reference.gradients(points, luma_seed)[1]) < 5 * TOLERANCE[isa]
+    assert error(distance, reference.gradients(points, distance_seed)[1]) < GRADIENT_TOLERANCE[isa]
+    assert error(luma, reference.gradients(points, luma_seed)[1]) < GRADIENT_TOLERANCE[isa]
     without = field.forward_with_gradient(points, luma=False)
     np.testing.assert_array_equal(without[1], distance)
     assert without[2] is None
@@ -165,9 +225,9 @@ def test_any_number_of_points(isa: str, threads: int) -> None:
         seeds = seeds_for(points)
         field = fused_field(isa, parameters, 64, threads)
         exact_parameters, exact_points = reference.gradients(points, seeds)
-        assert error(field.forward(points), reference.values(points)) < 2 * TOLERANCE[isa]
-        assert error(field.backward(points, seeds), exact_points) < 10 * TOLERANCE[isa]
-        assert error(field.gradients(), exact_parameters) < 10 * TOLERANCE[isa]
+        assert error(field.forward(points), reference.values(points)) < VALUE_TOLERANCE[isa]
+        assert error(field.backward(points, seeds), exact_points) < GRADIENT_TOLERANCE[isa]
+        assert error(field.gradients(), exact_parameters) < GRADIENT_TOLERANCE[isa]
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -189,9 +249,9 @@ def test_other_embeddings(isa: str, embedding: int) -> None:
     seeds = seeds_for(points)
     field = fused_field(isa, parameters, 128, embedding=embedding)
     exact_parameters, exact_points = reference.gradients(points, seeds)
-    assert error(field.forward(points), reference.values(points)) < TOLERANCE[isa]
-    assert error(field.backward(points, seeds), exact_points) < 5 * TOLERANCE[isa]
-    assert error(field.gradients(), exact_parameters) < 5 * TOLERANCE[isa]
+    assert error(field.forward(points), reference.values(points)) < VALUE_TOLERANCE[isa]
+    assert error(field.backward(points, seeds), exact_points) < GRADIENT_TOLERANCE[isa]
+    assert error(field.gradients(), exact_parameters) < GRADIENT_TOLERANCE[isa]
 
 
 @pytest.mark.parametrize("isa", ISAS)

@@ -41,7 +41,7 @@ class HandheldPath:
         rounds = max(whole, 1)
         turns = 2 * np.pi * round((route[-1, 3] - route[0, 3]) / (2 * np.pi))
         anchors = np.concatenate([np.add(route, (0, 0, 0, k * turns, 0)) for k in range(rounds)])
-        jitter = rng.normal(size=anchors.shape) * (0.05, 0.05, 0.04, 0.06, 0.03)
+        jitter = rng.normal(size=anchors.shape) * (0.05, 0.05, 0.04, 0.04, 0.03)
         jitter[0] = 0
         anchors += jitter
         end = np.add(anchors[0], (0, 0, 0, rounds * turns, 0))

@@ -35,7 +35,7 @@ def _route() -> NDArray[np.float64]:
             2.5 + 0.95 * np.sin(phase),
             2.0 + 0.50 * np.sin(2 * phase),
             1.30 + 0.14 * np.sin(phase + 0.8) + 0.06 * np.sin(3 * phase),
-            0.4 + phase + 0.22 * np.sin(2 * phase + 0.5),
+            0.4 + phase + 0.16 * np.sin(2 * phase + 0.5),
             np.radians(13 + 11 * np.sin(2 * phase + 1.0)),
         ],
         axis=1,

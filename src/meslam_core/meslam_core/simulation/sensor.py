@@ -27,6 +27,8 @@ class D435:
         baseline_m: between the two infrared imagers [m].
         depth_focal_px: focal length of the depth image at 848x480 [px].
         disparity_noise_px: standard deviation of the matched disparity [px].
+        calibration_error_px: standard deviation of the disparity's smooth, constant error, which
+            no averaging of frames removes [px].
         subpixel: disparities come in steps of 1/subpixel [px].
         nearest_m, farthest_m: range that is reported [m].
         grazing_cosine: surfaces below this cosine to the ray mostly return nothing.
@@ -40,6 +42,7 @@ class D435:
     baseline_m: float = 0.050
     depth_focal_px: float = 425.0
     disparity_noise_px: float = 0.08
+    calibration_error_px: float = 0.03
     subpixel: int = 32
     nearest_m: float = 0.28
     farthest_m: float = 6.0
@@ -50,8 +53,19 @@ class D435:
     color_noise: float = 2.2
     exposure_drift: float = 0.03
 
+    def distortion(self, camera: PinholeCamera, seed: int) -> NDArray[np.float32]:
+        """Disparity error (H, W) [px] that one specimen of the sensor makes in every frame."""
+        rng = np.random.default_rng((seed, 0xCA11B))
+        return _blobs(
+            rng, (camera.height, camera.width), camera.width / 5, self.calibration_error_px
+        )
+
     def depth(
-        self, view: View, camera: PinholeCamera, rng: np.random.Generator
+        self,
+        view: View,
+        camera: PinholeCamera,
+        distortion: NDArray[np.float32],
+        rng: np.random.Generator,
     ) -> NDArray[np.float32]:
         """Measured depth (H, W) [m] in whole millimetres, 0 where matching fails."""
         disparity_of_1m = np.float32(self.baseline_m * self.depth_focal_px)
@@ -60,7 +74,7 @@ class D435:
         safe = np.where(valid, ideal, np.float32(1))
         true_disparity = disparity_of_1m / safe
         noise = _blobs(rng, ideal.shape, 6.0, 0.75) + _blobs(rng, ideal.shape, 2.5, 0.66)
-        disparity = true_disparity + np.float32(self.disparity_noise_px) * noise
+        disparity = true_disparity + distortion + np.float32(self.disparity_noise_px) * noise
         disparity = np.round(disparity * self.subpixel) / np.float32(self.subpixel)
         measured = disparity_of_1m / np.maximum(disparity, np.float32(1e-3))
         keep = valid & self._matched(view, safe, camera, rng)

@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+from numpy.typing import NDArray
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.errors import ConfigError, RecordingError
@@ -34,8 +36,7 @@ class Simulation:
     Frames depend on nothing but the arguments of `simulate` and their index.
 
     Attributes:
-        name: scene and seed.
-        camera: intrinsics of both images.
+        name, path, format, topics, camera, stamps_ns: as every recording has.
         fps: frames a second.
         truth: T_scene_camera of every frame; the scene's z axis points up.
         surface: the exact surface in the scene's frame [m].
@@ -55,6 +56,9 @@ class Simulation:
         motion_blur_s: float,
     ) -> None:
         self.name = f"simulation {scene.name}, seed {seed}"
+        self.path = Path(f"{scene.name}.simulation")
+        self.format = "simulation"
+        self.topics: dict[str, str] = {}
         self.camera = camera
         self.fps = fps
         self.truth = truth
@@ -63,7 +67,13 @@ class Simulation:
         self._path = path
         self._seed = seed
         self._sensor = D435() if noise else None
+        self._distortion = D435().distortion(camera, seed)
         self._motion_blur_s = motion_blur_s
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Stamps of all frames [ns], shape (len,)."""
+        return self.truth.stamps_ns
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -96,7 +106,7 @@ class Simulation:
         return RgbdFrame(
             stamp_ns=stamp,
             color=self._sensor.color(view, rng, exposure),
-            depth_m=self._sensor.depth(view, self.camera, rng),
+            depth_m=self._sensor.depth(view, self.camera, self._distortion, rng),
             camera=self.camera,
         )
 

@@ -234,7 +234,7 @@ def _quantized(key: str, rows: NDArray[np.float32], kind: type, shape: tuple[int
     steps = 2.0**16 if kind is np.int8 else 1.0
     scale = np.ldexp(np.ceil(mantissa * steps) / steps, exponent).astype(np.float32)
     divisor = np.where(scale > 0, scale, np.float32(1)).astype(np.float64)
-    integers = np.clip(np.rint(rows / divisor[:, None]), -limit, limit).astype(kind)
+    integers: NDArray[Any] = np.clip(np.rint(rows / divisor[:, None]), -limit, limit).astype(kind)
     return {key: integers.reshape(shape), key + _SCALE: scale}
 
 

@@ -32,7 +32,7 @@ class RegionEntry:
     index: RegionIndex
     file: str
     sha256: str
-    bytes: int
+    size: int
     version: int
 
     @classmethod
@@ -70,7 +70,7 @@ class Manifest:
                 "side_m": float(self.grid.side_m),
                 "overlap": float(self.grid.overlap),
             },
-            "regions": [{**vars(e), "index": list(e.index)} for e in self.regions],
+            "regions": [_entry_to_json(entry) for entry in self.regions],
             "pose_graph": {"nodes": list(self.nodes)},
             "sha256": _BLANK.decode(),
         }
@@ -150,6 +150,16 @@ def grid_of(regions: list[StoredRegion]) -> RegionGrid:
     return RegionGrid(origin, first.side_m, 1.0 - spacing_m / first.side_m)
 
 
+def _entry_to_json(entry: RegionEntry) -> dict[str, Any]:
+    return {
+        "index": list(entry.index),
+        "file": entry.file,
+        "sha256": entry.sha256,
+        "bytes": entry.size,
+        "version": entry.version,
+    }
+
+
 def _entry(values: dict[str, Any]) -> RegionEntry:
     index = tuple(int(value) for value in values["index"])
     name = str(values["file"])
@@ -160,6 +170,6 @@ def _entry(values: dict[str, Any]) -> RegionEntry:
         index=(index[0], index[1], index[2]),
         file=name,
         sha256=str(values["sha256"]),
-        bytes=int(values["bytes"]),
+        size=int(values["bytes"]),
         version=int(values["version"]),
     )

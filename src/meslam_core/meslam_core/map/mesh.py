@@ -2,63 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from meslam_core.errors import MapError
-from meslam_core.map.neural_map import NeuralMap, PlacedRegion
+from meslam_core.map.neural_map import NeuralMap
+from meslam_core.map.placed_region import PlacedRegion
+from meslam_core.map.triangle_mesh import TriangleMesh, without_shards
 from meslam_core.regions.grid import RegionIndex
-from meslam_core.regions.observed_mask import NEAR_SURFACE
+from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED
 
+LATTICE_REACH = 1 << 19
 BLOCK = 8
 TILE_BLOCKS = 12
+COARSE = 2
+MAX_SLOPE = 1.5
 MIN_MARGIN = 1e-3
 MAX_REFINEMENT_VOXELS = 0.5
 MIN_SHARD_M2 = 0.01
 
 Progress = Callable[[int, int], None]
 Block = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class TriangleMesh:
-    """A surface in the map frame.
-
-    Attributes:
-        vertices: (V, 3) float32 [m].
-        triangles: (T, 3) int32, counter-clockwise seen from free space.
-        normals: (V, 3) float32 unit vectors into free space.
-        colors: (V, 3) uint8 RGB.
-    """
-
-    vertices: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    normals: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-
-    @property
-    def triangle_areas_m2(self) -> NDArray[np.float64]:
-        """Area (T,) of every triangle [m^2]."""
-        corners = self.vertices.astype(np.float64)[self.triangles]
-        edges = corners[:, 1:] - corners[:, :1]
-        return 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-
-    def selected(self, triangles: NDArray[np.bool_]) -> TriangleMesh:
-        """The mesh of some of the triangles (T,), without vertices that none of them uses."""
-        kept = self.triangles[triangles]
-        used = np.zeros(len(self.vertices), bool)
-        used[kept] = True
-        numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        return TriangleMesh(
-            self.vertices[used], numbers[kept], self.normals[used], self.colors[used]
-        )
 
 
 def extract_mesh(
@@ -99,26 +67,23 @@ def extract_mesh(
         builder.add(tile, blocks)
         if progress is not None:
             progress(number + 1, len(tiles))
-    mesh = builder.mesh()
+    mesh = _seen_from_front(builder.mesh(), neural_map)
     if box is not None:
-        inside = ((mesh.vertices >= box[0]) & (mesh.vertices <= box[1])).all(axis=1)
-        mesh = mesh.selected(inside[mesh.triangles].all(axis=1))
+        inside = np.all((mesh.vertices >= box[0]) & (mesh.vertices <= box[1]), axis=1)
+        mesh = mesh.selected(np.all(inside[mesh.triangles], axis=1))
     return without_shards(mesh, min_shard_m2)
 
 
-def without_shards(mesh: TriangleMesh, min_area_m2: float) -> TriangleMesh:
-    """A mesh without the connected pieces whose surface is smaller than `min_area_m2`."""
-    if min_area_m2 <= 0.0 or not len(mesh.triangles):
-        return mesh
-    a, b, c = mesh.triangles.T
-    count = len(mesh.vertices)
-    edges = coo_matrix(
-        (np.ones(2 * len(a), bool), (np.concatenate([a, b]), np.concatenate([b, c]))),
-        shape=(count, count),
-    )
-    _, labels = connected_components(edges, directed=False)
-    areas = np.bincount(labels[a], weights=mesh.triangle_areas_m2, minlength=labels.max() + 1)
-    return mesh.selected(areas[labels[a]] >= min_area_m2)
+def _seen_from_front(mesh: TriangleMesh, neural_map: NeuralMap) -> TriangleMesh:
+    """A mesh without surfaces that face space nobody saw.
+
+    A little more is marked as observed behind a surface than was trained; the field may cross
+    the level there again, which makes a false back to the wall.
+    """
+    ahead = mesh.vertices.astype(np.float64)
+    ahead += mesh.normals * max(region.stored.mask.voxel_m for region in neural_map.regions)
+    seen = neural_map.flags(ahead) & OBSERVED > 0
+    return mesh.selected(np.all(seen[mesh.triangles], axis=1))
 
 
 def _near_blocks(
@@ -131,8 +96,7 @@ def _near_blocks(
     found = [np.zeros((0, 3), np.int64)]
     for region in regions:
         mask = region.stored.mask
-        local = (np.argwhere(mask.flags & NEAR_SURFACE) + 0.5) * mask.voxel_m - mask.half_extent_m
-        centers = local @ region.rotation.T + region.center
+        centers = region.observed_centers(near_surface=True)
         reach = 0.5 * mask.voxel_m * np.abs(region.rotation).sum(axis=1) + resolution
         low = np.floor((centers - reach) / side).astype(np.int64)
         spread = np.floor((centers + reach) / side).astype(np.int64) - low
@@ -171,6 +135,7 @@ class _Builder:
         self._all = len(chosen) == len(neural_map.regions)
         self._chosen = chosen
         self._resolution = resolution
+        self._mask_voxel_m = min(region.stored.mask.voxel_m for region in chosen)
         self._edges: list[NDArray[np.int64]] = []
         self._triangles: list[NDArray[np.int64]] = []
         self._parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]] = []
@@ -179,56 +144,97 @@ class _Builder:
     def add(self, tile: Block, blocks: NDArray[np.int64]) -> None:
         """March through the blocks of one tile."""
         first = np.array(tile) * (TILE_BLOCKS * BLOCK)
-        side = TILE_BLOCKS * BLOCK + 1
         wanted = np.zeros((TILE_BLOCKS,) * 3, bool)
         wanted[tuple((blocks - np.array(tile) * TILE_BLOCKS).T)] = True
-        cells = wanted.repeat(BLOCK, 0).repeat(BLOCK, 1).repeat(BLOCK, 2)
-        corners = np.zeros((side,) * 3, bool)
+        cells = _enlarged(wanted, BLOCK // COARSE)
+        if 2 * COARSE * self._resolution <= self._mask_voxel_m:
+            cells = self._crossed(self._evaluate(cells, first, COARSE), cells)
+        cells = _enlarged(cells, COARSE)
+        if cells.any():
+            self._march(self._evaluate(cells, first, 1), cells, first)
+
+    def _evaluate(
+        self, cells: NDArray[np.bool_], first: NDArray[np.int64], stride: int
+    ) -> NDArray[np.float32]:
+        """f over the surface level at the corners (n + 1,)^3 of cells (n,)^3.
+
+        NaN where nothing was seen near a surface, or no cell asks.
+
+        Args:
+            cells: whose corners are wanted.
+            first: (3,) lattice point of the lowest corner.
+            stride: lattice steps from corner to corner.
+        """
+        side = cells.shape[0]
+        corners = np.zeros((side + 1,) * 3, bool)
         for step in product((0, 1), repeat=3):
-            corners[tuple(slice(s, s + side - 1) for s in step)] |= cells
+            corners[tuple(slice(s, s + side) for s in step)] |= cells
         lattice = np.argwhere(corners)
-        points = (lattice + first) * self._resolution
-        near = self._near(points)
-        lattice, points = lattice[near], points[near]
-        values = self._map.values(points).distance - self._map.surface_level
+        points = (lattice * stride + first) * self._resolution
+        answer = self._map.values(points, near_only=True)
+        values = answer.distance - np.float32(self._map.surface_level)
         # Keeps vertices off lattice points, where it is open which edge they lie on.
         values = np.where(values < 0.0, np.minimum(values, -MIN_MARGIN), values)
         values = np.where(values >= 0.0, np.maximum(values, MIN_MARGIN), values)
-        field = np.full((side,) * 3, np.nan, np.float32)
-        field[tuple(lattice.T)] = values
-        self._march(field, cells, first)
+        field = np.full(corners.shape, np.nan, np.float32)
+        field[tuple(lattice.T)] = np.where(self._near(points, answer.flags), values, np.nan)
+        return field
 
-    def _near(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which points (N, 3) a chosen region saw near a surface."""
+    def _crossed(
+        self, field: NDArray[np.float32], cells: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Which coarse cells the surface may cross, judged by the values at their corners.
+
+        No point of a cell is farther from a corner than half its diagonal; where every corner
+        is farther than that from the surface, on one side of it, the cell holds none.
+        """
+        side = cells.shape[0]
+        reach_m = 0.5 * np.sqrt(3.0) * COARSE * self._resolution * MAX_SLOPE
+        reach = np.float32(reach_m / self._map.truncation_m)
+        before, behind = np.zeros_like(cells), np.zeros_like(cells)
+        for step in product((0, 1), repeat=3):
+            corner = field[tuple(slice(s, s + side) for s in step)]
+            before |= corner < reach
+            behind |= corner > -reach
+        crossed: NDArray[np.bool_] = cells & before & behind
+        return crossed
+
+    def _near(
+        self, points: NDArray[np.floating], flags: NDArray[np.uint8]
+    ) -> NDArray[np.bool_]:
+        """Which points (N, 3) a chosen region saw near a surface; `flags` are any region's."""
         if self._all:
-            return (self._map.flags(points) & NEAR_SURFACE) > 0
+            return flags & NEAR_SURFACE > 0
         near = np.zeros(len(points), bool)
         for region in self._chosen:
-            near |= (region.lookup(region.to_local(points)) & NEAR_SURFACE) > 0
+            near |= region.lookup(region.to_local(points)) & NEAR_SURFACE > 0
         return near
 
     def _march(
         self, field: NDArray[np.float32], cells: NDArray[np.bool_], first: NDArray[np.int64]
     ) -> None:
+        """Triangles of the cells whose corners are all known."""
         known = np.isfinite(field)
         for step in product((0, 1), repeat=3):
             cells = cells & known[tuple(slice(s, s + cells.shape[0]) for s in step)]
         field = np.where(known, field, np.float32(-1.0))
-        if not cells.any() or field.max() < 0.0:
-            return
         # skimage asks for a cell at its upper corner.
         mask = np.zeros(field.shape, bool)
         mask[1:, 1:, 1:] = cells
+        if not cells.any() or field.max() < 0.0 or field.min() > 0.0:
+            return
         try:
-            vertices, triangles, _, _ = marching_cubes(field, 0.0, mask=mask)
+            vertices, triangles, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+                field, 0.0, mask=mask
+            )
         except (ValueError, RuntimeError):  # no cell holds a surface
             return
-        vertices = vertices.astype(np.float64) + first
-        self._edges.append(_edge_keys(vertices, self._count))
+        vertices = vertices.astype(np.float64)
+        self._edges.append(_edge_keys(vertices, first))
         # skimage winds them clockwise seen from the lower values, which are free space.
         self._triangles.append(triangles[:, ::-1].astype(np.int64) + self._count)
         self._count += len(vertices)
-        self._parts.append(self._finished(vertices * self._resolution))
+        self._parts.append(self._finished((vertices + first) * self._resolution))
 
     def _finished(
         self, vertices: NDArray[np.float64]
@@ -252,39 +258,40 @@ class _Builder:
                 np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8),
             )
         edges = np.concatenate(self._edges)
-        _, kept, number = np.unique(edges, axis=0, return_index=True, return_inverse=True)
-        vertices, normals, colors = (np.concatenate(part)[kept] for part in zip(*self._parts))
-        triangles = number.reshape(-1)[np.concatenate(self._triangles)].astype(np.int32)
+        inner = np.flatnonzero(edges < 0)
+        edges[inner] = -1 - inner
+        _, kept, number = np.unique(edges, return_index=True, return_inverse=True)
+        columns = zip(*self._parts, strict=True)
+        vertices, normals, colors = (np.concatenate(column)[kept] for column in columns)
+        triangles = number[np.concatenate(self._triangles)].astype(np.int32)
         a, b, c = triangles.T
         proper = (a != b) & (b != c) & (c != a)
         return TriangleMesh(vertices, triangles[proper], normals, colors)
 
 
-def _edge_keys(vertices: NDArray[np.float64], start: int) -> NDArray[np.int64]:
-    """A key (V, 4) of the lattice edge each vertex lies on: its lower end and its axis.
+def _enlarged(cells: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
+    """Every cell (n,)^3 as factor^3 cells."""
+    result: NDArray[np.bool_] = cells.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)
+    return result
 
-    Marching cubes also makes vertices inside cells; no other tile has those, they get a number
-    of their own.
+
+def _edge_keys(vertices: NDArray[np.float64], first: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The lattice edge each vertex of a tile lies on, the same number in every tile.
+
+    Marching cubes also makes vertices inside cells; no other tile has those, and their number
+    is -1.
+
+    Args:
+        vertices: (V, 3) lattice steps from `first`.
+        first: (3,) lattice point of the tile's lowest corner.
     """
     nearest = np.rint(vertices)
     off = np.abs(vertices - nearest)
     axis = off.argmax(axis=1)
     rows = np.arange(len(vertices))
-    lower = nearest.astype(np.int64)
-    lower[rows, axis] = np.floor(vertices[rows, axis]).astype(np.int64)
-    inner = np.sort(off, axis=1)[:, 1] > 0.25 * MIN_MARGIN
-    keys = np.concatenate([lower, axis[:, None]], axis=1)
-    keys[inner] = 0
-    keys[inner, 0] = start + rows[inner]
-    keys[inner, 3] = 3
-    return keys
-
-
-def block_count(neural_map: NeuralMap, resolution_m: float) -> int:
-    """Number of blocks that a mesh of the whole map looks at."""
-    return len(_near_blocks(neural_map.regions, resolution_m, None))
-
-
-def triangle_batches(mesh: TriangleMesh, size: int) -> Iterator[NDArray[np.int32]]:
-    """The triangles in batches of at most `size`, for messages of limited length."""
-    return (mesh.triangles[start : start + size] for start in range(0, len(mesh.triangles), size))
+    lower = nearest.astype(np.int64) + first
+    lower[rows, axis] = np.floor(vertices[rows, axis]).astype(np.int64) + first[axis]
+    x, y, z = (lower + LATTICE_REACH).T
+    keys = (((x * 2 * LATTICE_REACH + y) * 2 * LATTICE_REACH) + z) * 3 + axis
+    on_edge = np.sort(off, axis=1)[:, 1] < 0.25 * MIN_MARGIN
+    return np.where(on_edge, keys, -1)

@@ -1,24 +1,25 @@
-"""Meshes to files: PLY here, other formats through Open3D."""
+"""Meshes to files: PLY, glTF binary, and OBJ through Open3D."""
 
 from __future__ import annotations
 
+import json
 import os
+import struct
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import open3d as o3d
 
 from meslam_core.errors import OutputError
 from meslam_core.map.files import cannot_write, produce_atomically
-from meslam_core.map.mesh import TriangleMesh
+from meslam_core.map.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from open3d.geometry import TriangleMesh as Open3dMesh
 
-OPEN3D_FORMATS = (".obj", ".glb", ".gltf", ".stl", ".off")
-FORMATS = (".ply", *OPEN3D_FORMATS)
+FORMATS = (".ply", ".glb", ".obj")
 
 _PLY_VERTEX = np.dtype(
     [("position", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)]
@@ -31,7 +32,7 @@ def write_mesh(mesh: TriangleMesh, path: str | Path) -> None:
 
     Args:
         mesh: to write.
-        path: ending in one of FORMATS; PLY is binary with normals and colours.
+        path: ending in one of FORMATS; all hold normals and colours, PLY and GLB are binary.
 
     Raises:
         OutputError: for an unknown format, an empty mesh, or a place that cannot be written.
@@ -45,8 +46,10 @@ def write_mesh(mesh: TriangleMesh, path: str | Path) -> None:
     try:
         if suffix == ".ply":
             produce_atomically(path, lambda file: _write_ply(mesh, file))
+        elif suffix == ".glb":
+            produce_atomically(path, lambda file: _write_glb(mesh, file))
         else:
-            _write_open3d(mesh, path, suffix)
+            _write_obj(mesh, path)
     except OSError as error:
         raise cannot_write(path, error) from error
 
@@ -80,11 +83,49 @@ def _write_ply(mesh: TriangleMesh, file: BinaryIO) -> None:
     file.write(faces.tobytes())
 
 
-def _write_open3d(mesh: TriangleMesh, path: Path, suffix: str) -> None:
-    """Through a folder of its own, since some formats write several files."""
+def _write_glb(mesh: TriangleMesh, file: BinaryIO) -> None:
+    """One mesh in glTF 2.0's binary container; its node turns z up into glTF's y up."""
+    colors = np.full((len(mesh.colors), 4), 255, np.uint8)
+    colors[:, :3] = mesh.colors
+    parts = [mesh.triangles.astype("<u4"), mesh.vertices, mesh.normals, colors]
+    views, accessors, start = [], [], 0
+    for part, component, shape in zip(
+        parts, (5125, 5126, 5126, 5121), ("SCALAR", "VEC3", "VEC3", "VEC4"), strict=True
+    ):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": part.nbytes})
+        count = part.size if shape == "SCALAR" else len(part)
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": component, "count": count}
+            | {"type": shape, "normalized": component == 5121}
+        )
+        start += part.nbytes
+    accessors[1] |= {
+        "min": mesh.vertices.min(axis=0).tolist(), "max": mesh.vertices.max(axis=0).tolist()
+    }
+    attributes = {"POSITION": 1, "NORMAL": 2, "COLOR_0": 3}
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "MeSLAM"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0}]}],
+        "buffers": [{"byteLength": start}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + start))
+    file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+    file.write(struct.pack("<I4s", start, b"BIN\0"))
+    for part in parts:
+        file.write(part.tobytes())
+
+
+def _write_obj(mesh: TriangleMesh, path: Path) -> None:
+    """Through a folder of its own, since Open3D writes in place."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mesh-") as folder:
         temporary = Path(folder) / path.name
-        if not o3d.io.write_triangle_mesh(temporary.as_posix(), to_open3d(mesh)):
-            raise OutputError(f"{path}: Open3D could not write {suffix}; write .ply instead")
-        for produced in sorted(Path(folder).iterdir()):
-            os.replace(produced, path.parent / produced.name)
+        if not o3d.io.write_triangle_mesh(temporary, to_open3d(mesh)):
+            raise OutputError(f"{path}: Open3D could not write it; write .ply instead")
+        os.replace(temporary, path)

@@ -11,19 +11,16 @@ from numpy.typing import NDArray
 
 from meslam_core.config import MapConfig
 from meslam_core.errors import MapError
-from meslam_core.field.model import FieldModel
 from meslam_core.field.rendering import surface_level
+from meslam_core.map.placed_region import PlacedRegion, Points
 from meslam_core.map.stored_region import StoredRegion
 from meslam_core.regions.grid import RegionIndex
 from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED
 
 UNKNOWN, FREE, OCCUPIED = np.int8(-1), np.int8(0), np.int8(100)
 
-BATCH = 1 << 18
+BATCH = 1 << 16
 PROBABILITY_SCALE_M = 0.01
-MAX_EXPONENT = 600.0
-
-Points = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -40,45 +37,6 @@ class Values:
     flags: NDArray[np.uint8]
     distance: NDArray[np.float32]
     color: NDArray[np.float32]
-
-
-class PlacedRegion:
-    """A stored region with its network loaded and its place in the map."""
-
-    def __init__(self, stored: StoredRegion, backend: str) -> None:
-        self.stored = stored
-        self.field: FieldModel = stored.make_field(backend)
-        self.rotation = stored.T_map_region[:3, :3]
-        self.center = stored.T_map_region[:3, 3]
-        self.bounds = _observed_bounds(stored)
-
-    def to_local(self, points: Points) -> NDArray[np.float64]:
-        """Points (N, 3) about the region's centre, region axes [m]."""
-        return (np.asarray(points, np.float64) - self.center) @ self.rotation
-
-    def touches(self, low: Points, high: Points) -> bool:
-        """Whether anything observed may lie in a box of the map frame."""
-        return bool((self.bounds[0] <= high).all() and (self.bounds[1] >= low).all())
-
-    def lookup(self, local: Points) -> NDArray[np.uint8]:
-        """Flags (N,) of the observed mask at points about the centre."""
-        return self.stored.mask.lookup(local)
-
-    def predict(self, local: Points) -> NDArray[np.float32]:
-        """f and colour (N, 4) at points about the centre."""
-        return self.field.predict((local / self.stored.half_side_m).astype(np.float32))
-
-    def gradient(self, local: Points) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """f and colour (N, 4), and df/dpoint (N, 3) in map axes [1/m]."""
-        values, gradient, _ = self.field.probe(
-            (local / self.stored.half_side_m).astype(np.float32)
-        )
-        return values, gradient.astype(np.float64) @ self.rotation.T / self.stored.half_side_m
-
-    def log_weight(self, local: Points, blend_length: float) -> NDArray[np.float64]:
-        """Logarithm of the blending weight (N,): minus the distance to the centre."""
-        distance = np.linalg.norm(local, axis=1)
-        return -np.minimum(distance / (blend_length * self.stored.half_side_m), MAX_EXPONENT)
 
 
 class NeuralMap:
@@ -142,6 +100,13 @@ class NeuralMap:
             return np.zeros((2, 3))
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
+    @property
+    def observed_volume_m3(self) -> float:
+        """Volume that any region observed, counted once [m^3]; good to a voxel at borders."""
+        voxel_m = min(region.stored.mask.voxel_m for region in self.regions)
+        seen = [np.floor(region.observed_centers() / voxel_m) for region in self.regions]
+        return float(len(np.unique(np.concatenate(seen).astype(np.int32), axis=0))) * voxel_m**3
+
     def subset(self, indices: Iterable[RegionIndex]) -> list[PlacedRegion]:
         """The regions with the given places on the lattice.
 
@@ -157,6 +122,10 @@ class NeuralMap:
             raise MapError(f"there is no region {missing[0]}; the map has {sorted(by_index)}")
         return [region for index in wanted for region in by_index[index]]
 
+    def touching(self, low: Points, high: Points) -> list[PlacedRegion]:
+        """The regions that may have observed something between two corners (3,) [m]."""
+        return [region for region in self.regions if region.touches(low, high)]
+
     def flags(self, points: Points) -> NDArray[np.uint8]:
         """What any region observed (N,): OBSERVED and NEAR_SURFACE of the mask."""
         points = _checked(points)
@@ -166,14 +135,18 @@ class NeuralMap:
                 result[batch] |= region.lookup(region.to_local(points[batch]))
         return result
 
-    def values(self, points: Points, only: NDArray[np.bool_] | None = None) -> Values:
-        """The blended field at points (N, 3); `only` (N,) leaves the others unevaluated (NaN)."""
+    def values(self, points: Points, near_only: bool = False) -> Values:
+        """The blended field at points (N, 3).
+
+        Args:
+            points: (N, 3).
+            near_only: evaluate only where a surface was seen near, NaN elsewhere; faster.
+        """
         points = _checked(points)
         flags = np.zeros(len(points), np.uint8)
         values = np.empty((len(points), 4), np.float32)
         for batch in _batches(len(points)):
-            wanted = None if only is None else only[batch]
-            flags[batch], values[batch] = self._blend(points[batch], wanted)
+            flags[batch], values[batch] = self._blend(points[batch], near_only)
         return Values(flags, values[:, 0], values[:, 1:])
 
     def gradient(self, points: Points) -> tuple[Values, NDArray[np.float32]]:
@@ -182,12 +155,12 @@ class NeuralMap:
         flags = np.zeros(len(points), np.uint8)
         values = np.full((len(points), 7), np.nan, np.float32)
         for batch in _batches(len(points)):
-            flags[batch], values[batch] = self._blend(points[batch], None, gradient=True)
+            flags[batch], values[batch] = self._blend(points[batch], gradient=True)
         return Values(flags, values[:, 0], values[:, 1:4]), values[:, 4:]
 
     def density(self, points: Points) -> NDArray[np.float32]:
         """Volume density (N,) [1/m]; NaN where unknown."""
-        return self.density_scale * np.maximum(self.values(points).distance, 0.0)
+        return np.float32(self.density_scale) * np.maximum(self.values(points).distance, 0.0)
 
     def color(self, points: Points) -> NDArray[np.float32]:
         """RGB (N, 3) in [0, 1]; NaN where unknown. Meaningful near surfaces only."""
@@ -198,7 +171,7 @@ class NeuralMap:
 
         It saturates at about the truncation distance; NaN where unknown.
         """
-        return self._signed_distance(self.values(points).distance)
+        return self.to_meters(self.values(points).distance)
 
     def occupancy(
         self, points: Points, voxel_m: float = 0.0
@@ -220,9 +193,9 @@ class NeuralMap:
                 distance (plus half the voxel) over one centimetre, the accuracy of a map;
                 0.5 where unknown.
         """
-        values = self.values(points)
-        known = (values.flags & OBSERVED) > 0
-        depth_m = self._signed_distance(values.distance) + np.float32(0.5 * voxel_m)
+        values = self.values(points, near_only=True)
+        known = values.flags & OBSERVED > 0
+        depth_m = self.to_meters(values.distance) + np.float32(0.5 * voxel_m)
         # Only measured surfaces can be occupied; elsewhere rays passed.
         depth_m = np.where(values.flags & NEAR_SURFACE, depth_m, -self.truncation_m)
         probability = 1.0 / (1.0 + np.exp(-np.clip(depth_m / PROBABILITY_SCALE_M, -20, 20)))
@@ -232,62 +205,51 @@ class NeuralMap:
             np.where(known, probability, 0.5).astype(np.float32),
         )
 
-    def _signed_distance(self, distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    def to_meters(self, distance: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Signed distance to the surface [m], positive behind it, of values of f."""
         return (distance - np.float32(self.surface_level)) * np.float32(self.truncation_m)
 
     def _touching(self, points: Points) -> list[PlacedRegion]:
-        low, high = points.min(axis=0), points.max(axis=0)
-        return [region for region in self.regions if region.touches(low, high)]
+        return self.touching(points.min(axis=0), points.max(axis=0))
 
     def _blend(
-        self, points: Points, only: NDArray[np.bool_] | None, gradient: bool = False
+        self, points: Points, near_only: bool = False, gradient: bool = False
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Flags and the weighted mean of the values of all regions that observed a point."""
         flags = np.zeros(len(points), np.uint8)
-        total = np.zeros(len(points))
-        mean = np.zeros((len(points), 7 if gradient else 4))
+        located = []
         for region in self._touching(points):
             local = region.to_local(points)
             seen = region.lookup(local)
             flags |= seen
-            wanted = (seen & OBSERVED) > 0
-            chosen = np.flatnonzero(wanted if only is None else wanted & only)
+            located.append((region, local, seen & OBSERVED > 0))
+        wanted = flags & (NEAR_SURFACE if near_only else OBSERVED) > 0
+        total = np.zeros(len(points))
+        mean = np.zeros((len(points), 7 if gradient else 4))
+        for region, local, observed in located:
+            chosen = np.flatnonzero(observed & wanted)
             if not len(chosen):
                 continue
-            values: NDArray[np.floating] = np.empty(0)
-            if gradient:
-                values = np.concatenate(region.gradient(local[chosen]), axis=1)
-            else:
-                values = region.predict(local[chosen])
-            weight = np.exp(region.log_weight(local[chosen], self.config.blend_length))
+            local = local[chosen]
+            values: NDArray[np.floating] = (
+                np.concatenate(region.gradient(local), axis=1)
+                if gradient
+                else region.predict(local)
+            )
+            weight = np.exp(region.log_weight(local, self.config.blend_length))
             total[chosen] += weight
             mean[chosen] += weight[:, None] * values
         with np.errstate(invalid="ignore"):
             return flags, (mean / total[:, None]).astype(np.float32)
 
 
-def _observed_bounds(stored: StoredRegion) -> NDArray[np.float64]:
-    """Box (2, 3) of the map frame around everything a region observed; empty is (inf, -inf)."""
-    mask = stored.mask
-    corners = []
-    for axis in range(3):
-        others = tuple(other for other in range(3) if other != axis)
-        used = np.flatnonzero(mask.flags.any(axis=others))
-        if not len(used):
-            return np.array([[np.inf] * 3, [-np.inf] * 3])
-        corners.append(np.array([used[0], used[-1] + 1]) * mask.voxel_m - mask.half_extent_m)
-    box = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 3)
-    placed = box @ stored.T_map_region[:3, :3].T + stored.T_map_region[:3, 3]
-    return np.stack([placed.min(axis=0), placed.max(axis=0)])
-
-
 def _checked(points: Points) -> NDArray[np.float64]:
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise MapError(f"points have the shape {points.shape}, expected (N, 3)")
-    if not np.isfinite(points).all():
+    checked: NDArray[np.float64] = np.asarray(points, np.float64)
+    if checked.ndim != 2 or checked.shape[1] != 3:
+        raise MapError(f"points have the shape {checked.shape}, expected (N, 3)")
+    if not np.isfinite(checked).all():
         raise MapError("points hold values that are not finite")
-    return points
+    return checked
 
 
 def _batches(count: int) -> Iterator[slice]:

@@ -133,7 +133,7 @@ class MapStore:
     def map_bytes(self) -> int:
         """Size of the map on disk: its regions and the manifest."""
         manifest = self.manifest()
-        return sum(e.bytes for e in manifest.regions) + (self.path / MANIFEST).stat().st_size
+        return sum(e.size for e in manifest.regions) + (self.path / MANIFEST).stat().st_size
 
     def _save(
         self,

@@ -36,13 +36,16 @@ class ObservedMask:
         self.voxel_m = float(voxel_m)
         self.half_extent_m = 0.5 * flags.shape[0] * self.voxel_m
 
-    def _indices(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Flat voxel numbers (N,) and which points lie in the cube."""
+    def _locate(self, points: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        """Rows of the points (N, 3) inside the cube, and their flat voxel numbers."""
         count = self.flags.shape[0]
-        voxels = np.floor((points + self.half_extent_m) / self.voxel_m)
-        inside = ((voxels >= 0) & (voxels < count)).all(axis=-1)
-        voxels = np.where(inside[..., None], voxels, 0).astype(np.int64)
-        return (voxels[..., 0] * count + voxels[..., 1]) * count + voxels[..., 2], inside
+        x, y, z = (points.T / self.voxel_m + 0.5 * count).astype(np.float32, copy=False)
+        inside = (x >= 0) & (x < count) & (y >= 0) & (y < count) & (z >= 0) & (z < count)
+        rows = np.flatnonzero(inside)
+        if len(rows) < len(x):
+            x, y, z = x[rows], y[rows], z[rows]
+        flat = (x.astype(np.int32) * count + y.astype(np.int32)) * count + z.astype(np.int32)
+        return rows, flat
 
     def integrate(
         self,
@@ -59,22 +62,31 @@ class ObservedMask:
             distances_m: (R,) distance of the surface [m].
             truncation_m: depth behind the surface that counts as seen [m].
         """
+        if not len(distances_m):
+            return
         flat = self.flags.reshape(-1)
-        steps = np.arange(0.0, float(distances_m.max(initial=0.0)) + truncation_m, self.voxel_m)
-        for along in steps:
-            reached = distances_m + truncation_m >= along
-            points = origin + along * directions[reached]
-            index, inside = self._indices(points)
-            flat[index[inside]] |= OBSERVED
-        for offset in np.linspace(-truncation_m, truncation_m, 5):
-            points = origin + (distances_m + offset)[:, None] * directions
-            index, inside = self._indices(points)
-            flat[index[inside]] |= OBSERVED | NEAR_SURFACE
+        # In the order of their length, the rays that reach a distance are the last ones.
+        order = np.argsort(distances_m)
+        lengths = np.asarray(distances_m, np.float32)[order]
+        rays = np.asarray(directions, np.float32)[order]
+        start = np.asarray(origin, np.float32)
+        seen = lengths + np.float32(truncation_m)
+        steps = np.arange(0.0, float(seen[-1]), self.voxel_m, dtype=np.float32)
+        for along, first in zip(steps, np.searchsorted(seen, steps), strict=True):
+            _, voxels = self._locate(start + along * rays[first:])
+            flat[voxels] |= OBSERVED
+        for offset in np.linspace(-truncation_m, truncation_m, 5, dtype=np.float32):
+            _, voxels = self._locate(start + (lengths + offset)[:, None] * rays)
+            flat[voxels] |= OBSERVED | NEAR_SURFACE
 
     def lookup(self, points: NDArray[np.floating]) -> NDArray[np.uint8]:
         """Flags (N,) at points (N, 3) about the region's centre [m]; 0 outside the cube."""
-        index, inside = self._indices(points)
-        return np.where(inside, self.flags.reshape(-1)[index], np.uint8(0))
+        rows, voxels = self._locate(points)
+        if len(rows) == len(points):
+            return self.flags.reshape(-1)[voxels]
+        result = np.zeros(len(points), np.uint8)
+        result[rows] = self.flags.reshape(-1)[voxels]
+        return result
 
     @property
     def observed_volume_m3(self) -> float:

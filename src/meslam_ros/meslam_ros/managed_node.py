@@ -33,6 +33,7 @@ class ManagedNode(LifecycleNode):
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
         self.stop: Callable[[], None] = lambda: None
+        self.ended = False
         self.autostart = bool(self.declare_parameter("autostart", True).value)
 
     def configure(self) -> None:
@@ -68,6 +69,7 @@ class ManagedNode(LifecycleNode):
         steps = {"active": (self.deactivate, self.cleanup), "inactive": (self.cleanup,)}
         for step in steps.get(state.label, ()):
             self._step(step)
+        self.ended = True
         return TransitionCallbackReturn.SUCCESS
 
     def _step(self, step: Callable[[], None]) -> TransitionCallbackReturn:
@@ -115,7 +117,7 @@ def run(make_node: Callable[[], ManagedNode], executor_threads: int = 1) -> int:
         while not stopping:
             executor.spin_once(timeout_sec=1.0)
     finally:
-        if node.is_running:
+        if not node.ended:
             node.trigger_shutdown()
         executor.shutdown(timeout_sec=2.0)
         node.destroy_node()

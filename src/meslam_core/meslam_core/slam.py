@@ -29,6 +29,8 @@ T_BODY_OPTICAL: Pose = np.array(
 )
 CURRENT_FRAME_RAYS = 4096
 MIN_FRAME_PIXELS = 200
+# Below this share of inliers the other first guesses are tried too.
+CONFIDENT_INLIERS = 0.85
 UNTRUSTED_VARIANCE = 0.25
 
 
@@ -73,6 +75,15 @@ class FrameResult:
     is_keyframe: bool
     tracking_ms: float
     mapping_ms: float
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """Whether a frame's pose may train the map, and whether the field confirmed it."""
+
+    trusted: bool
+    by_field: bool = False
+    reason: str = ""
 
 
 @dataclass
@@ -127,22 +138,22 @@ class Slam:
         enough = np.count_nonzero(pixels) >= MIN_FRAME_PIXELS
         if self.atlas is None and enough:
             return self._start(frame, pixels, odometry, started)
-        alignment, reason = None, "too few pixels with depth"
+        alignment, verdict = None, _Verdict(trusted=False, reason="too few pixels with depth")
         if self.atlas is not None and enough:
-            alignment, reason = self._track(frame, pixels, odometry)
-        pose = self._accept(alignment, reason, odometry)
+            alignment, verdict = self._track(frame, pixels, odometry)
+        pose = self._accept(frame.stamp_ns, alignment, verdict, odometry)
         tracked = time.perf_counter()
         losses, iterations, is_keyframe = StepLosses(), 0, False
-        if self.atlas is not None and not reason:
+        if self.atlas is not None and verdict.trusted:
             losses, iterations, is_keyframe = self._map(frame, pixels, pose)
         self._remember(frame, pose, odometry)
         mapped = time.perf_counter()
         return FrameResult(
             stamp_ns=frame.stamp_ns,
             T_map_camera=pose,
-            covariance=_covariance(alignment, reason),
+            covariance=_covariance(alignment if verdict.by_field else None),
             state=self.state,
-            reason=reason,
+            reason=verdict.reason,
             odometry=odometry,
             residual_m=alignment.residual_m if alignment else float("inf"),
             inlier_ratio=alignment.inlier_ratio if alignment else 0.0,
@@ -218,24 +229,30 @@ class Slam:
 
     def _track(
         self, frame: RgbdFrame, pixels: NDArray[np.bool_], odometry: OdometryEstimate | None
-    ) -> tuple[Alignment, str]:
-        """Align a frame with the working region; a reason when the pose is not to be trusted."""
+    ) -> tuple[Alignment, _Verdict]:
+        """Align a frame with the working region and judge the result."""
         assert self.atlas is not None
         region = self.atlas.working
         rays = self._sample(frame, pixels, self.config.tracking.points)
         guesses = self._guesses(frame.stamp_ns, odometry)
         costs = [self.tracker.robust_cost(region, rays, guess) for guess in guesses]
-        alignment = self.tracker.align(region, rays, guesses[int(np.argmin(costs))])
-        return alignment, self._doubt(alignment)
+        alignments: list[Alignment] = []
+        for index in np.argsort(costs):
+            alignments.append(self.tracker.align(region, rays, guesses[index]))
+            if alignments[-1].inlier_ratio > CONFIDENT_INLIERS:
+                break
+        best = max(alignments, key=lambda alignment: alignment.inlier_ratio)
+        return best, self._judge(best, odometry)
 
     def _guesses(self, stamp_ns: int, odometry: OdometryEstimate | None) -> list[Pose]:
-        """First guesses of a pose: odometry since the last frame, and constant velocity."""
+        """First guesses of a pose: odometry since the last frame, constant velocity, standstill."""
         guesses = []
         last = self._frames[-1]
         if odometry is not None and odometry.valid and last.odometry is not None:
             motion = inverse(last.odometry.T_odom_camera) @ odometry.T_odom_camera
             guesses.append(self._latest_pose() @ motion)
         guesses.append(self._extrapolated(stamp_ns))
+        guesses.append(self._latest_pose())
         return [orthonormalized(guess) for guess in guesses]
 
     def _latest_pose(self) -> Pose:
@@ -253,32 +270,43 @@ class Slam:
         ahead = min((stamp_ns - last.stamp_ns) / elapsed, 3.0)
         return latest @ exp(ahead * log(orthonormalized(inverse(T_map_before) @ latest)))
 
-    def _doubt(self, alignment: Alignment) -> str:
-        """Why an alignment is not to be trusted; empty when it is."""
+    def _judge(self, alignment: Alignment, odometry: OdometryEstimate | None) -> _Verdict:
+        """Whether an alignment may be trusted, or odometry in its place."""
         limits = self.config.tracking
         if not np.isfinite(alignment.T_map_camera).all():
-            return "the pose is not finite"
+            return _Verdict(trusted=False, reason="the pose is not finite")
+        if alignment.observed_ratio < limits.min_observed_ratio:
+            # Beyond what is mapped only odometry knows; without it the map could not grow.
+            return _Verdict(
+                trusted=odometry is not None and odometry.valid,
+                reason=f"only {alignment.observed_ratio:.0%} of the view is mapped",
+            )
         if alignment.inlier_ratio < limits.min_inlier_ratio:
-            return f"only {alignment.inlier_ratio:.0%} of the points lie on the map"
+            share = f"{alignment.inlier_ratio:.0%}"
+            return _Verdict(trusted=False, reason=f"only {share} of the points lie on the map")
         if alignment.residual_m > limits.max_residual_m:
-            return f"points lie {alignment.residual_m * 100:.1f} cm off the map"
-        return ""
+            distance = f"{alignment.residual_m * 100:.1f} cm"
+            return _Verdict(trusted=False, reason=f"points lie {distance} off the map")
+        return _Verdict(trusted=True, by_field=True)
 
     def _accept(
-        self, alignment: Alignment | None, reason: str, odometry: OdometryEstimate | None
+        self,
+        stamp_ns: int,
+        alignment: Alignment | None,
+        verdict: _Verdict,
+        odometry: OdometryEstimate | None,
     ) -> Pose:
         """The frame's pose and the tracking state that follows."""
-        if alignment is not None and not reason:
+        if alignment is not None and verdict.by_field:
             self._untrusted = 0
             self.state = TrackingState.OK
             return alignment.T_map_camera
         if self.atlas is None:
             return self._T_map_first.copy()
-        self._untrusted += 1
+        self._untrusted = 0 if verdict.trusted else self._untrusted + 1
         lost = self._untrusted >= self.config.tracking.lost_after_frames
         self.state = TrackingState.LOST if lost else TrackingState.DEGRADED
-        stamp = odometry.stamp_ns if odometry else self._frames[-1].stamp_ns
-        return self._guesses(stamp, odometry)[0]
+        return self._guesses(stamp_ns, odometry)[0]
 
     def _map(
         self, frame: RgbdFrame, pixels: NDArray[np.bool_], pose: Pose
@@ -288,7 +316,11 @@ class Slam:
         self.atlas.update(pose[:3, 3])
         region = self.atlas.working
         is_keyframe = self.policy.is_keyframe(
-            region, self.keyframes, len(self.keyframes) - 1, frame.camera, pose,
+            region,
+            self.keyframes,
+            len(self.keyframes) - 1,
+            frame.camera,
+            pose,
             self._sample(frame, pixels, self.policy.PIXELS),
         )
         if is_keyframe:
@@ -308,9 +340,7 @@ class Slam:
         rays = self._sample(frame, pixels, self.config.keyframes.rays)
         self.atlas.add_keyframe(self.keyframes.add(frame.stamp_ns, pose, rays))
 
-    def _remember(
-        self, frame: RgbdFrame, pose: Pose, odometry: OdometryEstimate | None
-    ) -> None:
+    def _remember(self, frame: RgbdFrame, pose: Pose, odometry: OdometryEstimate | None) -> None:
         if not len(self.keyframes):
             return
         reference = len(self.keyframes) - 1
@@ -320,8 +350,8 @@ class Slam:
         )
 
 
-def _covariance(alignment: Alignment | None, reason: str) -> NDArray[np.float64]:
-    if alignment is None or reason:
+def _covariance(alignment: Alignment | None) -> NDArray[np.float64]:
+    """Covariance (6, 6) of a pose; `None` where the field did not confirm it."""
+    if alignment is None:
         return np.eye(6) * UNTRUSTED_VARIANCE
-    information = alignment.information + np.eye(6)
-    return np.linalg.inv(information)
+    return np.linalg.inv(alignment.information + np.eye(6))

@@ -135,9 +135,7 @@ class JointOptimizer:
         T_map_current: Pose,
     ) -> tuple[Rays, torch.Tensor, torch.Tensor]:
         count = self.config.current_rays
-        slots = torch.randint(
-            len(current), (count,), generator=self._generator, device=self.device
-        )
+        slots = torch.randint(len(current), (count,), generator=self._generator, device=self.device)
         pose = torch.from_numpy(T_map_current).float().to(self.device)
         joined = Rays(
             torch.cat([rays.directions, current.directions[slots]]),

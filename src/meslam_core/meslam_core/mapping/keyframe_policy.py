@@ -66,9 +66,7 @@ class KeyframePolicy:
         error = np.abs(rendered - rays.distances_m.numpy()) / rays.distances_m.numpy()
         return float(np.mean(error < self.config.agreement_tolerance))
 
-    def rendered_distances(
-        self, region: Region, T_map_camera: Pose, rays: Rays
-    ) -> np.ndarray:
+    def rendered_distances(self, region: Region, T_map_camera: Pose, rays: Rays) -> np.ndarray:
         """Rendered distances (R,) along rays [m]; samples reach past the farthest measurement."""
         count = len(rays)
         far = 1.2 * float(rays.distances_m.max())

@@ -31,9 +31,7 @@ class Rays:
 
     def to(self, device: torch.device) -> Rays:
         """The same rays on another device."""
-        return Rays(
-            self.directions.to(device), self.distances_m.to(device), self.colors.to(device)
-        )
+        return Rays(self.directions.to(device), self.distances_m.to(device), self.colors.to(device))
 
 
 def rays_at(frame: RgbdFrame, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Rays:
@@ -103,7 +101,12 @@ class KeyframeStore:
     def _grow(self) -> None:
         self._capacity = max(16, 2 * self._capacity)
         for name in (
-            "_directions", "_distances", "_colors", "_rotations", "_translations", "_losses",
+            "_directions",
+            "_distances",
+            "_colors",
+            "_rotations",
+            "_translations",
+            "_losses",
         ):
             old = getattr(self, name)
             new = old.new_zeros((self._capacity, *old.shape[1:]))

@@ -6,6 +6,8 @@ the last motion as a first guess keeps fast rotation within the registration's b
 
 from __future__ import annotations
 
+import dataclasses
+import logging
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,8 @@ from meslam_core.frame import RgbdFrame
 from meslam_core.odometry.odometry import OdometryEstimate
 from meslam_core.odometry.registration import Registrar, Registration
 from meslam_core.se3 import Pose, exp, inverse, log, orthonormalized, rotation_angle
+
+logger = logging.getLogger(__name__)
 
 UNKNOWN_VARIANCE = 1.0
 NANOSECONDS = 1e-9
@@ -36,6 +40,7 @@ class KeyframeOdometry:
         self._config = odometry
         self._sensor = sensor
         self._keyframe: Any = None
+        self._previous: Any = None
         self._T_odom_keyframe: Pose = np.eye(4)
         self._T_odom_last: Pose = np.eye(4)
         self._velocity: NDArray[np.float64] = np.zeros(6)
@@ -46,7 +51,8 @@ class KeyframeOdometry:
         """Register the next frame; the first one is the origin of the odometry frame."""
         prepared = self._registrar.prepare(frame)
         if self._last_stamp_ns is None:
-            self._keyframe, self._last_stamp_ns = prepared, frame.stamp_ns
+            self._keyframe = self._previous = prepared
+            self._last_stamp_ns = frame.stamp_ns
             return OdometryEstimate(
                 frame.stamp_ns, np.eye(4), np.eye(6) * 1e-8, 1.0, 0.0, valid=True
             )
@@ -56,13 +62,12 @@ class KeyframeOdometry:
         valid = not reason
         T_odom_camera = guess
         if valid:
-            T_odom_camera = orthonormalized(
-                self._T_odom_keyframe @ registration.T_target_source
-            )
+            T_odom_camera = orthonormalized(self._T_odom_keyframe @ registration.T_target_source)
         motion = inverse(self._T_odom_last) @ T_odom_camera
         self._velocity = log(motion) / elapsed_s if valid else 0.5 * self._velocity
         self._T_odom_last, self._last_stamp_ns = T_odom_camera, frame.stamp_ns
         self._failures = 0 if valid else self._failures + 1
+        self._previous = prepared
         if self._is_new_keyframe(T_odom_camera, registration, valid):
             self._keyframe, self._T_odom_keyframe = prepared, T_odom_camera
         return OdometryEstimate(
@@ -75,26 +80,49 @@ class KeyframeOdometry:
             reason=reason,
         )
 
-    def _register(
-        self, prepared: Any, guess: Pose, elapsed_s: float
-    ) -> tuple[Registration, str]:
+    def _register(self, prepared: Any, guess: Pose, elapsed_s: float) -> tuple[Registration, str]:
+        """Register against the keyframe, harder where that fits badly; why a result is invalid."""
+        best = self._attempt(prepared, self._keyframe, self._T_odom_keyframe, guess, wide=False)
+        if best.fitness < self._config.good_fitness:
+            attempts = [
+                (self._keyframe, self._T_odom_keyframe, guess),
+                (self._previous, self._T_odom_last, guess),
+                (self._previous, self._T_odom_last, self._T_odom_last),
+            ]
+            for target, T_odom_target, start in attempts:
+                retried = self._attempt(prepared, target, T_odom_target, start, wide=True)
+                best = max(best, retried, key=lambda result: result.fitness)
+                if best.fitness >= self._config.good_fitness:
+                    break
+        return best, self._objection(best, elapsed_s)
+
+    def _attempt(
+        self, prepared: Any, target: Any, T_odom_target: Pose, guess: Pose, wide: bool
+    ) -> Registration:
+        """One registration, expressed against the keyframe; fitness 0 where it fails."""
         failed = Registration(np.eye(4), np.zeros((6, 6)), 0.0, float("inf"))
         try:
             result = self._registrar.register(
-                prepared, self._keyframe, inverse(self._T_odom_keyframe) @ guess
+                prepared, target, inverse(T_odom_target) @ guess, wide=wide
             )
         except RuntimeError as error:
-            return failed, f"registration failed: {str(error).splitlines()[0]}"
+            logger.debug("registration failed: %s", error)
+            return failed
         if not np.isfinite(result.T_target_source).all():
-            return failed, "registration diverged"
+            return failed
+        to_keyframe = inverse(self._T_odom_keyframe) @ T_odom_target
+        return dataclasses.replace(result, T_target_source=to_keyframe @ result.T_target_source)
+
+    def _objection(self, result: Registration, elapsed_s: float) -> str:
+        """Why a result is not to be trusted; empty when it is."""
         if result.fitness < self._config.min_fitness:
-            return result, f"only {result.fitness:.0%} of the points match"
+            return f"only {result.fitness:.0%} of the points match"
         motion = inverse(self._T_odom_last) @ self._T_odom_keyframe @ result.T_target_source
         speed = np.linalg.norm(motion[:3, 3]) / elapsed_s
         turn = np.rad2deg(rotation_angle(motion)) / elapsed_s
         if speed > self._config.max_speed_m_s or turn > self._config.max_turn_deg_s:
-            return result, f"impossible motion: {speed:.1f} m/s, {turn:.0f} deg/s"
-        return result, ""
+            return f"impossible motion: {speed:.1f} m/s, {turn:.0f} deg/s"
+        return ""
 
     def _is_new_keyframe(
         self, T_odom_camera: Pose, registration: Registration, valid: bool
@@ -105,7 +133,7 @@ class KeyframeOdometry:
         offset = inverse(self._T_odom_keyframe) @ T_odom_camera
         moved = float(np.linalg.norm(offset[:3, 3])) > self._config.keyframe_translation_m
         turned = np.rad2deg(rotation_angle(offset)) > self._config.keyframe_rotation_deg
-        return moved or turned or registration.fitness < 1.4 * self._config.min_fitness
+        return moved or turned or registration.fitness < self._config.good_fitness
 
 
 def _covariance(registration: Registration, valid: bool) -> NDArray[np.float64]:

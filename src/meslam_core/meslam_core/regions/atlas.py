@@ -132,9 +132,7 @@ class RegionAtlas:
         """A new region that continues the working region's map exactly, and its replay."""
         parent, region = self.working, self._new_region(index)
         offset = (region.T_map_region - parent.T_map_region)[:3, 3] / parent.half_side_m
-        region.field.load_flat(
-            shifted(parent.field.flat(), self.config.field.embedding, offset)
-        )
+        region.field.load_flat(shifted(parent.field.flat(), self.config.field.embedding, offset))
         region.keyframes = [k for k in parent.keyframes if self._sees(region, k)]
         region.keyframes = region.keyframes or parent.keyframes[-1:]
         for keyframe in region.keyframes:

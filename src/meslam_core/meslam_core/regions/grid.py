@@ -57,9 +57,7 @@ class RegionGrid:
         ]
         return [(i, j, k) for i, j, k in product(*candidates)]
 
-    def distance_past_middle(
-        self, position: NDArray[np.floating], working: RegionIndex
-    ) -> float:
+    def distance_past_middle(self, position: NDArray[np.floating], working: RegionIndex) -> float:
         """How far [m] a position lies past the middle of the working region's intersections.
 
         Negative inside the part that is nearer to the working region than to any neighbour.

@@ -32,7 +32,8 @@ class Alignment:
         T_map_camera: (4, 4) pose.
         information: (6, 6) of (translation [m], rotation [rad]) about the camera centre, map axes.
         residual_m: median absolute distance to the surface [m].
-        inlier_ratio: share of points within the inlier distance.
+        inlier_ratio: share within the inlier distance, of the points in observed space.
+        observed_ratio: share of the points that lie in observed space.
         iterations: Gauss-Newton steps taken.
         converged: the last step was below the threshold.
     """
@@ -41,6 +42,7 @@ class Alignment:
     information: NDArray[np.float64]
     residual_m: float
     inlier_ratio: float
+    observed_ratio: float
     iterations: int
     converged: bool
 
@@ -54,6 +56,7 @@ class _Residuals:
     luma: NDArray[np.float64]
     luma_jacobian: NDArray[np.float64]
     usable: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
 
 
 class FieldTracker:
@@ -88,18 +91,19 @@ class FieldTracker:
                 converged = True
                 break
         pose = orthonormalized(pose)
-        residual, inliers = self.quality(region, rays, pose)
-        return Alignment(pose, information, residual, inliers, iteration, converged)
-
-    def quality(self, region: Region, rays: Rays, T_map_camera: Pose) -> tuple[float, float]:
-        """Median absolute distance to the surface [m] and inlier ratio of a pose."""
-        residuals = self._residuals(region, rays, T_map_camera)
-        distance = np.abs(residuals.distance)
-        # Far from any surface the field is saturated and its gradient means nothing.
-        distance = np.where(residuals.usable, distance, np.inf)
-        inliers = float(np.mean(distance < self.config.inlier_distance_m))
-        finite = distance[np.isfinite(distance)]
-        return (float(np.median(finite)) if len(finite) else np.inf), inliers
+        residuals = self._residuals(region, rays, pose)
+        distance = np.abs(residuals.distance[residuals.usable])
+        inliers = np.count_nonzero(distance < self.config.inlier_distance_m)
+        observed = np.count_nonzero(residuals.observed)
+        return Alignment(
+            T_map_camera=pose,
+            information=information,
+            residual_m=float(np.median(distance)) if len(distance) else float("inf"),
+            inlier_ratio=inliers / max(observed, 1),
+            observed_ratio=observed / max(len(rays), 1),
+            iterations=iteration,
+            converged=converged,
+        )
 
     def robust_cost(self, region: Region, rays: Rays, T_map_camera: Pose) -> float:
         """Mean Geman-McClure cost in [0, 1] of a pose; compares first guesses."""
@@ -125,7 +129,10 @@ class FieldTracker:
         gradient = gradient.astype(np.float64) @ to_map
         luma_gradient = luma_gradient.astype(np.float64) @ to_map
         slope = np.linalg.norm(gradient, axis=1)
-        usable = (np.abs(values[:, 0]) < SATURATION) & (slope > 1.0)
+        # What the network says of space that nobody saw means nothing, and neither does its
+        # gradient where it is saturated, far from any surface.
+        observed = region.mask.lookup(points) > 0
+        usable = observed & (np.abs(values[:, 0]) < SATURATION) & (slope > 1.0)
         slope = np.maximum(slope, 1e-6)
         distance = (values[:, 0] - surface_level(region.field.config)) / slope
         normal = gradient / slope[:, None]
@@ -136,6 +143,7 @@ class FieldTracker:
             luma=luma,
             luma_jacobian=np.concatenate([luma_gradient, np.cross(arms, luma_gradient)], axis=1),
             usable=usable,
+            observed=observed,
         )
 
     def _solve(

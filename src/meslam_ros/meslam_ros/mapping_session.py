@@ -81,6 +81,12 @@ class MappingSession:
         return atlas.working.index if atlas else (0, 0, 0)
 
     @property
+    def training_regions(self) -> list[RegionIndex]:
+        """Lattice indices of the regions that are trained without influence on the pose."""
+        atlas = self._slam.atlas if self._slam else None
+        return [region.index for region in atlas.training] if atlas else []
+
+    @property
     def keyframes(self) -> int:
         """Number of keyframes."""
         return len(self._slam.keyframes) if self._slam else 0

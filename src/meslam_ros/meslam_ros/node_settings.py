@@ -8,10 +8,16 @@ from meslam_core.config import setting
 
 
 @dataclass(frozen=True)
-class FrameSettings:
-    """Coordinate frames (REP-105)."""
+class MapFrameSettings:
+    """The one frame that a map needs."""
 
     map_frame: str = setting("map", "frame that the map and /meslam/pose are given in")
+
+
+@dataclass(frozen=True)
+class FrameSettings(MapFrameSettings):
+    """Coordinate frames (REP-105)."""
+
     odom_frame: str = setting("odom", "frame of the odometry, between the map and the base")
     base_frame: str = setting(
         "camera_link",
@@ -96,10 +102,22 @@ class TrackingSettings:
 
 
 @dataclass(frozen=True)
+class RegionManagerSettings:
+    """Parameters of the region manager alone."""
+
+    regions_period_s: float = setting(
+        0.5,
+        "regions that grow are published at most once in this time; other changes at once",
+        unit="s",
+        minimum=0.05,
+        maximum=60.0,
+    )
+
+
+@dataclass(frozen=True)
 class MapServerSettings:
     """Parameters of the map server alone; the limits bound what one request may cost."""
 
-    map_frame: str = FrameSettings.map_frame
     export_folder: str = setting(
         "meslam_exports", "export_map writes only below this folder; it is made when needed"
     )

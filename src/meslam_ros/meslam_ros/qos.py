@@ -20,6 +20,10 @@ STREAM = QoSProfile(depth=50)
 """Reliable results a frame: poses, status, odometry."""
 
 
+MODELS_DEPTH = 1000
+"""Regions that may arrive at once at a late subscriber."""
+
+
 def latched(depth: int = 1) -> QoSProfile:
     """Reliable, and kept for those who come later."""
     return QoSProfile(

@@ -15,7 +15,7 @@ from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.slam import TrackingState
-from meslam_interfaces.msg import TrackingStatus
+from meslam_interfaces.msg import RegionIndex, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
 from meslam_ros.frame_worker import WARNING_PERIOD_S, FrameWorker
@@ -173,6 +173,7 @@ class TrackingNode(ManagedNode):
         status.map_id = session.map_id
         status.keyframes = session.keyframes
         status.working_region = session.working_region
+        status.training_regions = [RegionIndex(index=i) for i in session.training_regions]
         status.map_bytes = self._models.map_bytes
         status.latency_s = time.monotonic() - pair.arrival_s
         status.frames_tracked = session.tracked

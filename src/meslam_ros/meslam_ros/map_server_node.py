@@ -1,0 +1,131 @@
+"""`map_server_node`: answers about the map, from the regions' stored networks alone."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+
+import torch
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+
+from meslam_core.errors import FrameError, MapError
+from meslam_core.se3 import Pose
+from meslam_interfaces.msg import RegionModel
+from meslam_interfaces.srv import (
+    ExportMap,
+    GetMesh,
+    GetOccupancyGrid,
+    ListRegions,
+    LoadMap,
+    QueryOccupancy,
+    SaveMap,
+)
+from meslam_ros import topics
+from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, WARN, Diagnostics, counts
+from meslam_ros.managed_node import ManagedNode, run
+from meslam_ros.map_models import MapModels
+from meslam_ros.map_requests import MapRequests
+from meslam_ros.map_topics import MapTopics
+from meslam_ros.node_settings import MapFrameSettings, MapServerSettings
+from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.qos import MODELS_DEPTH, latched
+from meslam_ros.region_messages import model_name
+from meslam_ros.rgbd_input import STEADY
+
+EXECUTOR_THREADS = 4
+
+
+class MapServerNode(ManagedNode):
+    """Collects region models and serves the map; long answers do not hold up short ones."""
+
+    def __init__(self) -> None:
+        super().__init__("map_server_node")
+        self._frames = declare_settings(self, MapFrameSettings)
+        self._settings = declare_settings(self, MapServerSettings)
+        self._config = declare_config(self, ("regions", "map", "runtime"))
+        torch.set_num_threads(self._config.runtime.threads)
+
+    def configure(self) -> None:
+        self._models = MapModels(self._config, self._frames.map_frame)
+        self._refused: Counter[str] = Counter()
+        requests = MapRequests(
+            self._models,
+            self._settings,
+            self._config.regions.overlap,
+            self._frames.map_frame,
+            self._lookup,
+            self.get_logger().error,
+        )
+        group = ReentrantCallbackGroup()
+        self._map_services = [
+            self.create_service(kind, name, requests.answer(handler), callback_group=group)
+            for kind, name, handler in (
+                (ExportMap, topics.EXPORT_MAP, requests.export_map),
+                (GetMesh, topics.GET_MESH, requests.get_mesh),
+                (QueryOccupancy, topics.QUERY_OCCUPANCY, requests.query_occupancy),
+                (GetOccupancyGrid, topics.GET_OCCUPANCY_GRID, requests.get_occupancy_grid),
+                (SaveMap, topics.SAVE_MAP, requests.save_map),
+                (LoadMap, topics.LOAD_MAP, requests.load_map),
+                (ListRegions, topics.LIST_REGIONS, requests.list_regions),
+            )
+        ]
+        self._diagnostics = Diagnostics(self)
+
+    def activate(self) -> None:
+        self._subscription = self.create_subscription(
+            RegionModel,
+            topics.REGION_MODELS,
+            self._take_model,
+            latched(MODELS_DEPTH),
+            callback_group=MutuallyExclusiveCallbackGroup(),
+        )
+        self._topics = MapTopics(self, self._models, self._settings, self._frames.map_frame)
+        self._timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
+
+    def deactivate(self) -> None:
+        self.destroy_timer(self._timer)
+        self._topics.close()
+        self.destroy_subscription(self._subscription)
+
+    def cleanup(self) -> None:
+        self._diagnostics.close()
+        for service in self._map_services:
+            self.destroy_service(service)
+
+    def _take_model(self, model: RegionModel) -> None:
+        try:
+            self._models.add(model)
+        except MapError as error:
+            self._refused[model_name(model)] += 1
+            self.get_logger().error(f"region model refused: {error}")
+
+    def _lookup(self, frame: str, stamp_ns: int) -> Pose:
+        """T_map_frame (4, 4) [m]."""
+        raise FrameError(
+            f"points in the frame {frame!r} are not known here; give them in "
+            f"{self._frames.map_frame!r}"
+        )
+
+    def _diagnose(self) -> None:
+        entries, refused = self._models.entries(), counts(self._refused)
+        level, message = (OK, f"{len(entries)} regions") if entries else (STALE, "no region yet")
+        if refused:
+            level, message = WARN, f"region models refused: {refused}"
+        self._diagnostics.report(
+            level,
+            message,
+            {
+                "regions": len(entries),
+                "map_bytes": sum(entry.size for entry in entries),
+                "refused": refused or "none",
+            },
+        )
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(MapServerNode, EXECUTOR_THREADS))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""`region_manager_node`: which regions the map has, and which of them are being optimised."""
+
+from __future__ import annotations
+
+import sys
+
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
+
+from meslam_interfaces.msg import RegionArray, RegionModel, TrackingStatus
+from meslam_ros import topics
+from meslam_ros.conversions import to_stamp
+from meslam_ros.managed_node import ManagedNode, run
+from meslam_ros.markers import region_markers
+from meslam_ros.node_settings import MapFrameSettings, RegionManagerSettings
+from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.qos import MODELS_DEPTH, STREAM, latched
+from meslam_ros.region_catalog import RegionCatalog, RegionEntry, region_index
+from meslam_ros.rgbd_input import STEADY
+
+
+class RegionManagerNode(ManagedNode):
+    """Joins the regions' models with tracking's word on which of them work."""
+
+    def __init__(self) -> None:
+        super().__init__("region_manager_node")
+        self._frames = declare_settings(self, MapFrameSettings)
+        self._settings = declare_settings(self, RegionManagerSettings)
+        self._config = declare_config(self, ("regions",))
+        self._catalog = RegionCatalog()
+        self._live_map_id = ""
+        self._changed = False
+
+    def configure(self) -> None:
+        self._regions = self.create_publisher(RegionArray, topics.REGIONS, latched())
+        self._markers = self.create_publisher(MarkerArray, topics.REGION_MARKERS, latched())
+
+    def activate(self) -> None:
+        self._models = self.create_subscription(
+            RegionModel, topics.REGION_MODELS, self._take_model, latched(MODELS_DEPTH)
+        )
+        self._status = self.create_subscription(
+            TrackingStatus, topics.STATUS, self._take_status, STREAM
+        )
+        self._changed = True
+        self._timer = self.create_timer(self._settings.regions_period_s, self._tick, clock=STEADY)
+
+    def deactivate(self) -> None:
+        self.destroy_timer(self._timer)
+        self.destroy_subscription(self._models)
+        self.destroy_subscription(self._status)
+
+    def cleanup(self) -> None:
+        self.destroy_publisher(self._regions)
+        self.destroy_publisher(self._markers)
+        self._catalog.begin("")
+
+    def _take_model(self, model: RegionModel) -> None:
+        if self._live_map_id not in ("", model.map_id) or not self._catalog.is_news(model):
+            return
+        if model.map_id != self._catalog.map_id:
+            self._catalog.begin(model.map_id)
+        is_new = region_index(model.index) not in self._catalog.entries
+        self._catalog.add(RegionEntry.of(model))
+        self._changed = True
+        if is_new:
+            self._publish()
+
+    def _take_status(self, status: TrackingStatus) -> None:
+        self._live_map_id = status.map_id
+        if status.map_id != self._catalog.map_id:
+            self._catalog.begin(status.map_id)
+            self._publish()
+        training = {region_index(entry.index) for entry in status.training_regions}
+        if self._catalog.set_active(region_index(status.working_region), training):
+            self._publish()
+
+    def _tick(self) -> None:
+        if self._changed:
+            self._publish()
+
+    def _publish(self) -> None:
+        self._changed = False
+        self._regions.publish(
+            self._catalog.message(self._frames.map_frame, self._config.regions.overlap)
+        )
+        header = Header(
+            stamp=to_stamp(self._catalog.newest_stamp_ns), frame_id=self._frames.map_frame
+        )
+        self._markers.publish(
+            MarkerArray(markers=region_markers(self._catalog.entries.values(), header))
+        )
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(RegionManagerNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -4,7 +4,7 @@
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #pragma GCC target("amx-tile,amx-bf16,avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma")
 #define MESLAM_USE_TILES
-#define MESLAM_BLOCK 64
+#define MESLAM_BLOCK 192
 #include "bf16_backend.hpp"
 
 namespace meslam {

@@ -22,7 +22,7 @@ from meslam_core.recordings.lens import Lens
 
 SILENCE_S = 10.0
 """Playback that delivers nothing for so long has failed [s]."""
-_DRAINING_S = 0.5
+_DRAINING_S = 2.0
 _QUEUED_FRAMES = 8
 
 _LENS_MODELS = {"brown_conrady": "plumb_bob", "kannala_brandt4": "equidistant"}
@@ -164,8 +164,11 @@ class Playback:
         try:
             for sensor, profiles in self._sensors:
                 sensor.open(profiles)
+            # Playback begins with the first sensor and would drop frames of those not started yet.
+            self._device.as_playback().pause()
             for sensor, _ in self._sensors:
                 sensor.start(receive)
+            self._device.as_playback().resume()
         except RuntimeError as error:
             raise RecordingError(f"librealsense cannot play {self._path}: {error}") from error
 

@@ -1,15 +1,20 @@
-"""A sphere in a room, known exactly, and regions whose networks learnt it."""
+"""A sphere in a room, known exactly, and regions whose networks learnt it.
+
+Run as a program it trains the network anew and stores its weights beside this file.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from meslam_core.config import FieldConfig
-from meslam_core.field.model import TorchField
+from meslam_core.field import make_field
+from meslam_core.field.model import FieldModel
 from meslam_core.field.network import shifted
 from meslam_core.field.rendering import surface_level
 from meslam_core.map.stored_region import Architecture, StoredRegion
@@ -18,6 +23,7 @@ from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED, ObservedMa
 SIDE_M = 30.0 ** (1.0 / 3.0)
 MASK_VOXEL_M = 0.08
 MASK_EXTENT_M = 2.4
+WEIGHTS = Path(__file__).with_name("sphere_in_room.npy")
 
 
 @dataclass(frozen=True)
@@ -79,9 +85,9 @@ class SphereInRoom:
 
 def trained_field(
     scene: SphereInRoom, steps: int = 500, config: FieldConfig | None = None, seed: int = 0
-) -> TorchField:
+) -> FieldModel:
     """A field that learnt the scene about its centre from exact distances and colours."""
-    field = TorchField(config or FieldConfig(), seed)
+    field = make_field(config or FieldConfig(), seed)
     level = surface_level(field.config)
     generator = np.random.default_rng(seed)
     for step in range(steps):
@@ -98,7 +104,7 @@ def trained_field(
 
 
 def stored(
-    field: TorchField,
+    field: FieldModel,
     scene: SphereInRoom,
     index: tuple[int, int, int] = (0, 0, 0),
     center: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -119,3 +125,14 @@ def stored(
         stamp_ns=1_700_000_000_123_456_789,
         keyframes=12,
     )
+
+
+def learnt_field(backend: str = "auto") -> FieldModel:
+    """The field that `trained_field` made once; training it anew takes too long for a test."""
+    field = make_field(FieldConfig(backend=backend), 0)
+    field.load_flat(np.load(WEIGHTS, allow_pickle=False))
+    return field
+
+
+if __name__ == "__main__":
+    np.save(WEIGHTS, trained_field(SphereInRoom(), steps=4000).flat(), allow_pickle=False)

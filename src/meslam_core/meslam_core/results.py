@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any
 
 from meslam_core.errors import OutputError
-from meslam_core.map.store import MANIFEST
+from meslam_core.map.manifest import MANIFEST
 
 TRAJECTORY = "trajectory.txt"
 ONLINE_TRAJECTORY = "trajectory_online.txt"

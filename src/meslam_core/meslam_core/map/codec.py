@@ -252,7 +252,8 @@ def _weights_from_tensors(
             rows = values.reshape(1 if key in _ENCODING else shape[0], -1)
             if scale is None or scale.dtype != np.float32 or scale.shape != (len(rows),):
                 raise MapError(f"{name}: tensor {key + _SCALE!r} is missing or malformed")
-            values = rows * scale[:, None]
+            with np.errstate(invalid="ignore", over="ignore"):  # checked below
+                values = rows * scale[:, None]
         elif stored.dtype not in (np.float16, np.float32) or scale is not None:
             raise MapError(f"{name}: tensor {key!r} has an unknown type {stored.dtype}")
         parts.append(values.reshape(-1))

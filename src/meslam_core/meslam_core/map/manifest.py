@@ -15,6 +15,7 @@ from meslam_core.errors import MapError
 from meslam_core.map.stored_region import StoredRegion
 from meslam_core.regions.grid import RegionGrid, RegionIndex
 
+MANIFEST = "manifest.json"
 MAP_FORMAT = "meslam-map"
 MAP_VERSION = 1
 MAX_MANIFEST_BYTES = 16 << 20

@@ -13,6 +13,7 @@ from meslam_core.config import MapConfig
 from meslam_core.errors import MapError
 from meslam_core.field.rendering import surface_level
 from meslam_core.map.placed_region import PlacedRegion, Points
+from meslam_core.map.reader import read_map
 from meslam_core.map.stored_region import StoredRegion
 from meslam_core.regions.grid import RegionIndex
 from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED
@@ -88,9 +89,7 @@ class NeuralMap:
         Raises:
             MapError: when the path is no map or nothing of it can be read.
         """
-        from meslam_core.map.store import MapStore
-
-        return cls(MapStore(path).load().regions, config, backend)
+        return cls(read_map(Path(path)).regions, config, backend)
 
     @property
     def bounds(self) -> NDArray[np.float64]:

@@ -71,8 +71,8 @@ def occupancy_grid(
         )
     middle = 0.5 * (min_height_m + max_height_m)
     steps = np.arange(levels) - 0.5 * (levels - 1)
-    heights: NDArray[np.float64] = middle + steps * resolution_m
-    origin: NDArray[np.float64] = first * float(resolution_m)
+    heights = np.asarray(middle + steps * resolution_m, np.float64)
+    origin = np.asarray(first * resolution_m, np.float64)
     cells = np.full((int(height), int(width)), UNKNOWN)
     for row in range(0, int(height), TILE_CELLS):
         for column in range(0, int(width), TILE_CELLS):

@@ -13,7 +13,6 @@ import hashlib
 import os
 import uuid
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,38 +25,17 @@ from meslam_core.map.files import (
     write_atomically,
 )
 from meslam_core.map.manifest import (
-    MAX_MANIFEST_BYTES,
+    MANIFEST,
     Manifest,
     NewerMapError,
     RegionEntry,
-    grid_of,
     is_region_file,
 )
+from meslam_core.map.reader import LoadedMap, read_manifest, read_map
 from meslam_core.map.stored_region import StoredRegion
 from meslam_core.regions.grid import RegionGrid, RegionIndex
 
-MANIFEST = "manifest.json"
 QUARANTINE = "quarantine"
-READ_ATTEMPTS = 3
-
-
-@dataclass(frozen=True)
-class LoadedMap:
-    """A map read from a store.
-
-    Attributes:
-        map_id: identifies the map.
-        grid: the lattice of its regions.
-        regions: those that are intact.
-        nodes: of the pose graph.
-        warnings: one sentence for every damage found; empty for an intact map.
-    """
-
-    map_id: str
-    grid: RegionGrid
-    regions: list[StoredRegion]
-    nodes: tuple[dict[str, Any], ...] = ()
-    warnings: list[str] = field(default_factory=list)
 
 
 class MapStore:
@@ -114,20 +92,11 @@ class MapStore:
         Raises:
             MapError: when there is no map, nothing of it can be read, or a newer program wrote it.
         """
-        for _ in range(READ_ATTEMPTS):
-            data = self._read_manifest(recover)
-            loaded, vanished = self._load(data)
-            # A writer may have replaced the map between reading its manifest and its files.
-            if not vanished or self._read_manifest(recover) == data:
-                break
-        if not loaded.regions and loaded.warnings:
-            raise MapError(f"{self.path}: no region can be read: {loaded.warnings[0]}")
-        return loaded
+        return read_map(self.path, recover)
 
     def manifest(self) -> Manifest:
         """The manifest alone; raises as `load`, also where it is damaged."""
-        data = self._read_manifest(recover=False)
-        return Manifest.from_bytes(data or b"", str(self.path / MANIFEST))
+        return Manifest.from_bytes(read_manifest(self.path), str(self.path / MANIFEST))
 
     @property
     def map_bytes(self) -> int:
@@ -218,72 +187,6 @@ class MapStore:
                     os.unlink(path)
         sync_folder(self.path)
 
-    def _read_manifest(self, recover: bool) -> bytes | None:
-        """The manifest's bytes; None where it is missing and that is no obstacle."""
-        path = self.path / MANIFEST
-        try:
-            with open(path, "rb") as file:
-                return file.read(MAX_MANIFEST_BYTES + 1)
-        except FileNotFoundError:
-            if recover and self.path.is_dir():
-                return None
-            if not self.path.is_dir():
-                raise MapError(f"{self.path} does not exist or is no folder of a map") from None
-            raise MapError(
-                f"{self.path} holds no {MANIFEST}: it is no map, or its first save was "
-                "interrupted; what was written can be loaded with recovery"
-            ) from None
-        except OSError as error:
-            raise MapError(f"{path} cannot be read: {error.strerror}") from error
-
-    def _load(self, data: bytes | None) -> tuple[LoadedMap, bool]:
-        """The map of a manifest, and whether a file it names was not there."""
-        try:
-            manifest = Manifest.from_bytes(data or b"", str(self.path / MANIFEST))
-        except NewerMapError:
-            raise
-        except MapError as error:
-            return self._rebuilt(str(error)), False
-        loaded = LoadedMap(manifest.map_id, manifest.grid, [], manifest.nodes)
-        vanished = False
-        for entry in manifest.regions:
-            try:
-                loaded.regions.append(self._read_region(entry))
-            except FileNotFoundError:
-                vanished = True
-                loaded.warnings.append(f"{self.path / entry.file} is missing; region left out")
-            except (MapError, OSError) as error:
-                loaded.warnings.append(f"region {entry.index} left out: {error}")
-        return loaded, vanished
-
-    def _read_region(self, entry: RegionEntry) -> StoredRegion:
-        path = self.path / entry.file
-        data = _read_limited(path)
-        if hashlib.sha256(data).hexdigest() != entry.sha256:
-            raise MapError(f"{path}: the checksum does not match the manifest; it is damaged")
-        region = codec.decode(data, str(path))
-        if region.index != entry.index:
-            raise MapError(f"{path} holds region {region.index} instead of {entry.index}")
-        return region
-
-    def _rebuilt(self, reason: str) -> LoadedMap:
-        """The map as far as its region files tell it: the newest intact one of each place."""
-        newest: dict[RegionIndex, StoredRegion] = {}
-        warnings = [f"{reason}; the map is put together from its region files"]
-        for name in sorted(filter(is_region_file, os.listdir(self.path))):
-            try:
-                region = codec.decode(_read_limited(self.path / name), str(self.path / name))
-            except (MapError, OSError) as error:
-                warnings.append(f"left out: {error}")
-                continue
-            other = newest.get(region.index)
-            if other is None or (region.stamp_ns, region.version) > (other.stamp_ns, other.version):
-                newest[region.index] = region
-        if not newest:
-            raise MapError(f"{reason}; there is no intact region file to rebuild the map from")
-        regions = [newest[index] for index in sorted(newest)]
-        return LoadedMap(uuid.uuid4().hex, grid_of(regions), regions, (), warnings)
-
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         """The folder, made where it is missing, with no other writer in it."""
@@ -315,12 +218,6 @@ class MapStore:
                 if _is_ours(name):
                     os.unlink(self.path / name)
             os.rmdir(self.path)
-
-
-def _read_limited(path: Path) -> bytes:
-    """A region file's bytes, one more than the maximum at most."""
-    with open(path, "rb") as file:
-        return file.read(codec.MAX_FILE_BYTES + 1)
 
 
 def _is_ours(name: str) -> bool:

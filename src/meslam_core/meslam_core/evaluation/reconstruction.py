@@ -153,18 +153,20 @@ def depth_error(
     T_truth_map: Pose | None = None,
     farthest_m: float = 4.0,
     views: int = 20,
+    pixel_step: int = 2,
 ) -> DepthError:
     """Error of the reconstruction's depth seen from true poses, evenly chosen.
 
     Raises:
         EvaluationError: when a mesh has no triangles or no view shows the true surface.
     """
+    coarse = camera.scaled(1 / pixel_step)
     renderer = MeshRenderer(_moved(reconstruction, T_truth_map))
     true_renderer = MeshRenderer(surface)
     errors, covered = [], []
     for index in np.linspace(0, len(truth) - 1, min(views, len(truth))).round().astype(int):
-        _, depth = renderer.render(camera, truth.poses[index])
-        _, true_depth = true_renderer.render(camera, truth.poses[index])
+        _, depth = renderer.render(coarse, truth.poses[index])
+        _, true_depth = true_renderer.render(coarse, truth.poses[index])
         inside = (true_depth > 0) & (true_depth <= farthest_m)
         covered.append(depth[inside] > 0)
         errors.append(np.abs(depth[inside] - true_depth[inside]))
@@ -197,7 +199,7 @@ def sample(mesh: o3d.geometry.TriangleMesh, count: int) -> NDArray[np.float32]:
     outside = shares.sum(axis=1) > 1
     shares[outside] = 1 - shares[outside]
     points = corners[chosen, 0] + np.einsum("nk,nkj->nj", shares, edges[chosen])
-    return points.astype(np.float32)
+    return np.asarray(points, np.float32)
 
 
 def distances(points: NDArray[np.floating], mesh: o3d.geometry.TriangleMesh) -> NDArray[np.float32]:
@@ -211,7 +213,8 @@ def distances(points: NDArray[np.floating], mesh: o3d.geometry.TriangleMesh) -> 
     caster = o3d.t.geometry.RaycastingScene()
     caster.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
     query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32))
-    return np.asarray(caster.compute_distance(query).numpy())
+    found: NDArray[np.float32] = caster.compute_distance(query).numpy()
+    return found
 
 
 def _moved(mesh: o3d.geometry.TriangleMesh, transform: Pose | None) -> o3d.geometry.TriangleMesh:

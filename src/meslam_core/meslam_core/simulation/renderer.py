@@ -56,7 +56,7 @@ class Renderer:
     """
 
     def __init__(self, scene: Scene, texel_scale: float = 1.0, seed: int = 0) -> None:
-        self.surface = _surface(scene)
+        self.surface = scene_surface(scene)
         self._caster = o3d.t.geometry.RaycastingScene()
         self._caster.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(self.surface))
         layout = lay_out(scene.patches, texel_scale)
@@ -137,7 +137,7 @@ class Renderer:
         return color
 
 
-def _surface(scene: Scene) -> o3d.geometry.TriangleMesh:
+def scene_surface(scene: Scene) -> o3d.geometry.TriangleMesh:
     """All patches as one mesh whose triangles keep the patches' order."""
     vertices, triangles, first = [], [], 0
     for patch in scene.patches:

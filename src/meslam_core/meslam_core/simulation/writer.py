@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import suppress
 from pathlib import Path
 
 import open3d as o3d
@@ -49,18 +49,19 @@ def write_simulation(
         (surface_path(partial), surface_path(target)),
         (partial, target),
     ]
-    with ExitStack() as cleanup:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_tum(pairs[0][0], simulation.truth)
+        if not o3d.io.write_triangle_mesh(pairs[1][0], simulation.surface):
+            raise OutputError(f"{surface_path(target)} cannot be written; is there space left?")
+        convert(simulation, partial, progress)
+        for source, destination in pairs:
+            source.replace(destination)
+    except OSError as error:
+        raise OutputError(
+            f"{target} cannot be written ({error}); choose a folder that is writable"
+        ) from error
+    finally:
         for source, _ in pairs:
-            cleanup.callback(source.unlink, missing_ok=True)
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            write_tum(pairs[0][0], simulation.truth)
-            if not o3d.io.write_triangle_mesh(pairs[1][0], simulation.surface):
-                raise OutputError(f"{surface_path(target)} cannot be written; is there space left?")
-            convert(simulation, partial, progress)
-            for source, destination in pairs:
-                source.replace(destination)
-        except OSError as error:
-            raise OutputError(
-                f"{target} cannot be written ({error}); choose a folder that is writable"
-            ) from error
+            with suppress(OSError):
+                source.unlink()

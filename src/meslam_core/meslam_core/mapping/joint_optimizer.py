@@ -200,7 +200,7 @@ class JointOptimizer:
         counts = torch.zeros_like(sums)
         sums.index_add_(0, chosen, losses)
         counts.index_add_(0, chosen, torch.ones_like(losses))
-        seen = counts > 0
+        seen = (counts > 0) & torch.isfinite(sums)
         mean = sums[seen] / counts[seen]
         self.keyframes.losses[seen] = (
             LOSS_MEMORY * self.keyframes.losses[seen] + (1 - LOSS_MEMORY) * mean

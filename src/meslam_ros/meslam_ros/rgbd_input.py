@@ -87,7 +87,8 @@ class RgbdInput:
             node, CameraInfo, topics.DEPTH_INFO, lambda m: self._infos.__setitem__("depth", m)
         )
         self._subscriptions = (self._color, self._depth, self._color_info, self._depth_info)
-        self._last_pair_s = self._last_report_s = time.monotonic()
+        self._last_pair_s = time.monotonic()
+        self._next_report_s = settings.input_timeout_s
         self._timer = node.create_timer(GRAPH_PERIOD_S, self._watch, clock=STEADY)
 
     def close(self) -> None:
@@ -211,11 +212,12 @@ class RgbdInput:
     def _watch(self) -> None:
         for subscription in self._subscriptions:
             subscription.update()
-        now = time.monotonic()
-        timeout_s = self._settings.input_timeout_s
-        if now - max(self._last_pair_s, self._last_report_s) >= timeout_s:
-            self._last_report_s = now
-            self._node.get_logger().warn(self.waiting_for(now - self._last_pair_s))
+        silence_s = time.monotonic() - self._last_pair_s
+        if silence_s < self._settings.input_timeout_s:
+            self._next_report_s = self._settings.input_timeout_s
+        elif silence_s >= self._next_report_s:
+            self._next_report_s = 2.0 * silence_s
+            self._node.get_logger().warn(self.waiting_for(silence_s))
 
     def waiting_for(self, silence_s: float) -> str:
         """What is missing, for people: topics, publishers and the likely cause."""

@@ -16,6 +16,7 @@ from meslam_core.evaluation.reconstruction import (
     sample,
     surface_error,
 )
+from meslam_core.evaluation.report import surface_entries
 from meslam_core.trajectory import Trajectory
 
 CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -98,6 +99,15 @@ def test_depth_error_counts_holes_as_the_clip():
     assert depth.median_m == pytest.approx(0.02, abs=1e-4)
     assert depth.coverage == pytest.approx(0.5, abs=0.01)
     assert depth.clipped_mean_m == pytest.approx(0.06, abs=0.001)
+
+
+def test_report_of_a_mesh_names_every_error():
+    truth, half_left = standing_still(), plane(2.02, width=2.0)
+    entries = surface_entries(half_left, plane(2.0), CAMERA, truth, np.eye(4))
+    assert entries["accuracy_median_m"] == pytest.approx(0.02, abs=1e-4)
+    assert entries["depth_median_m"] == pytest.approx(0.02, abs=1e-4)
+    assert entries["depth_coverage"] == pytest.approx(0.5, abs=0.02)
+    assert entries["completion_ratio"] < 0.6
 
 
 def test_samples_follow_the_area_and_repeat():

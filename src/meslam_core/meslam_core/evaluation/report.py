@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import open3d as o3d
+
+from meslam_core.camera import PinholeCamera
 from meslam_core.errors import EvaluationError
 from meslam_core.evaluation.alignment import ASSOCIATION_TOLERANCE_S
+from meslam_core.evaluation.reconstruction import depth_error, observed_surface, surface_error
 from meslam_core.evaluation.trajectory_error import (
     absolute_error,
     frame_jitter_m,
     relative_error_by_frames,
     relative_error_by_time,
 )
+from meslam_core.se3 import Pose
 from meslam_core.trajectory import Trajectory
 
 
@@ -76,3 +81,31 @@ def truth_entries(
     entries["ate_online_rmse_m"] = live.rmse_m
     entries["jitter_online_m"] = frame_jitter_m(live.estimate, live.truth, tolerance_s=tolerance_s)
     return entries
+
+
+def surface_entries(
+    reconstruction: o3d.geometry.TriangleMesh,
+    surface: o3d.geometry.TriangleMesh,
+    camera: PinholeCamera,
+    truth: Trajectory,
+    T_truth_map: Pose,
+) -> dict[str, float]:
+    """What a report says of a mesh where the true surface is known.
+
+    Args:
+        reconstruction: in the map's frame [m].
+        surface: the exact surface in the truth's frame [m].
+        camera: intrinsics of the recording.
+        truth: T_truth_camera of the recording, to know what was observed.
+        T_truth_map: (4, 4), such as the alignment of the trajectories (`AbsoluteError.mounting`).
+
+    Returns:
+        The fields of `SurfaceError` and, prefixed with `depth_`, of `DepthError`.
+
+    Raises:
+        EvaluationError: when a mesh is empty or nothing of the surface was observed.
+    """
+    observed = observed_surface(surface, camera, truth)
+    error = surface_error(reconstruction, surface, observed, T_truth_map=T_truth_map)
+    depth = depth_error(reconstruction, surface, camera, truth, T_truth_map=T_truth_map)
+    return {**error.to_dict(), **depth.to_dict()}

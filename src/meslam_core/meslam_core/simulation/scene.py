@@ -96,7 +96,7 @@ def box(
     textures: Texture | dict[str, Texture],
     *,
     yaw: float = 0.0,
-    texel_m: float = 0.002,
+    texel_m: float = 0.0025,
     without: Sequence[str] = ("bottom",),
 ) -> list[Patch]:
     """A box turned about the vertical, its faces unrolled one by one.
@@ -139,7 +139,7 @@ def cylinder(
     texture: Texture,
     *,
     top_radius_m: float | None = None,
-    texel_m: float = 0.002,
+    texel_m: float = 0.0025,
     segments: int = 32,
 ) -> list[Patch]:
     """An upright cylinder or cone frustum on `base`, with a lid and no bottom."""
@@ -182,7 +182,12 @@ def cylinder(
 
 
 def sphere(
-    center: Vector, radius_m: float, texture: Texture, *, texel_m: float = 0.002, segments: int = 40
+    center: Vector,
+    radius_m: float,
+    texture: Texture,
+    *,
+    texel_m: float = 0.0025,
+    segments: int = 40,
 ) -> Patch:
     """A sphere unrolled by longitude and latitude."""
     longitudes = np.linspace(0, 2 * np.pi, segments + 1)

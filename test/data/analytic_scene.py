@@ -18,9 +18,11 @@ from meslam_core.field.model import FieldModel
 from meslam_core.field.network import shifted
 from meslam_core.field.rendering import surface_level
 from meslam_core.map.stored_region import Architecture, StoredRegion
+from meslam_core.regions.grid import RegionGrid
 from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED, ObservedMask
 
 SIDE_M = 30.0 ** (1.0 / 3.0)
+GRID = RegionGrid(np.zeros(3), SIDE_M, 0.2)
 MASK_VOXEL_M = 0.08
 MASK_EXTENT_M = 2.4
 WEIGHTS = Path(__file__).with_name("sphere_in_room.npy")

@@ -6,16 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from data.analytic_scene import SIDE_M, SphereInRoom, learnt_field, stored
+from data.analytic_scene import GRID, SIDE_M, SphereInRoom, learnt_field, stored
 
 from meslam_core.config import FieldConfig
 from meslam_core.field import make_field
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.stored_region import Architecture, StoredRegion
-from meslam_core.regions.grid import RegionGrid
 from meslam_core.regions.observed_mask import ObservedMask
-
-GRID = RegionGrid(np.zeros(3), SIDE_M, 0.2)
 
 
 @pytest.fixture(scope="session")

@@ -67,7 +67,7 @@ def read_manifest(path: Path) -> bytes:
     try:
         with open(path / MANIFEST, "rb") as file:
             return file.read(MAX_MANIFEST_BYTES + 1)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         if not path.is_dir():
             raise MapError(f"{path} does not exist or is no folder of a map") from None
         raise MapError(

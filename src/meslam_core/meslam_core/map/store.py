@@ -185,32 +185,30 @@ class MapStore:
                     os.replace(path, self.path / QUARANTINE / name)
                 else:
                     os.unlink(path)
-        sync_folder(self.path)
+        with contextlib.suppress(OSError):
+            sync_folder(self.path)
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         """The folder, made where it is missing, with no other writer in it."""
         created = not self.path.exists()
-        self.path.mkdir(parents=True, exist_ok=True)
-        if created:
-            sync_folder(self.path.parent)
-        descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield
-        except BlockingIOError as error:
-            raise OutputError(
-                f"{self.path} is being written by another program; wait until it is done"
-            ) from error
-        except BaseException:
+        with contextlib.ExitStack() as stack:
             if created:
-                self._remove_unfinished()
-            raise
-        finally:
-            os.close(descriptor)
+                stack.callback(self._remove_unfinished)
+                self.path.mkdir(parents=True)
+                sync_folder(self.path.parent)
+            descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, descriptor)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise OutputError(
+                    f"{self.path} is being written by another program; wait until it is done"
+                ) from error
+            yield
 
     def _remove_unfinished(self) -> None:
-        """Leave nothing behind of a first save that failed."""
+        """Leave nothing behind of a first save that failed; does nothing where it did not."""
         with contextlib.suppress(OSError):
             if (self.path / MANIFEST).exists():
                 return

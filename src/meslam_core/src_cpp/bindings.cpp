@@ -1,65 +1,15 @@
-// The Python module meslam_core.field._kernel. Arrays are checked here, once; below, sizes fit.
-#include <pybind11/numpy.h>
-#include <pybind11/pybind11.h>
+// The Python module meslam_core.field._kernel: a field's parameters, values and gradients.
+#include "bindings.hpp"
+
 #include <pybind11/stl.h>
 
 #include <string>
-#include <utility>
+#include <vector>
 
 #include "cpu_features.hpp"
-#include "fused_field.hpp"
-
-namespace py = pybind11;
 
 namespace meslam {
 namespace {
-
-using Array = py::array_t<float>;
-
-std::string describe_shape(const py::array& array) {
-    std::string text = "(";
-    for (py::ssize_t axis = 0; axis < array.ndim(); ++axis) {
-        if (axis > 0) text += ", ";
-        text += std::to_string(array.shape(axis));
-    }
-    return text + ")";
-}
-
-void check_floats(const py::array& array, const char* name) {
-    if (!py::isinstance<py::array_t<float>>(array)) {
-        throw py::type_error(std::string(name) + " has dtype " +
-                             std::string(py::str(array.dtype())) + "; float32 is expected");
-    }
-    if (!(array.flags() & py::array::c_style)) {
-        throw py::value_error(std::string(name) +
-                              " is not C-contiguous; pass numpy.ascontiguousarray of it");
-    }
-}
-
-// The numbers of an array of shape (rows, columns); any number of rows where rows is negative.
-const float* matrix(const py::array& array, const char* name, py::ssize_t rows,
-                    py::ssize_t columns) {
-    check_floats(array, name);
-    if (array.ndim() != 2 || array.shape(1) != columns || (rows >= 0 && array.shape(0) != rows)) {
-        const std::string expected = rows < 0 ? "N" : std::to_string(rows);
-        throw py::value_error(std::string(name) + " has shape " + describe_shape(array) + "; (" +
-                              expected + ", " + std::to_string(columns) + ") is expected");
-    }
-    return static_cast<const float*>(array.data());
-}
-
-const float* flat(const py::array& array, const char* name, size_t count) {
-    check_floats(array, name);
-    if (array.ndim() != 1 || static_cast<size_t>(array.shape(0)) != count) {
-        throw py::value_error(std::string(name) + " has shape " + describe_shape(array) + "; (" +
-                              std::to_string(count) + ",) is expected");
-    }
-    return static_cast<const float*>(array.data());
-}
-
-Array new_matrix(size_t rows, py::ssize_t columns) {
-    return Array({static_cast<py::ssize_t>(rows), columns});
-}
 
 Array new_parameters(const FusedField& field) {
     return Array(static_cast<py::ssize_t>(field.shape().parameters));
@@ -176,8 +126,8 @@ PYBIND11_MODULE(_kernel, module) {
     module.doc() = "Fused evaluation and training of a region's neural field.";
     module.def("available_isas", available_isas, "Instruction sets usable here, the best first.");
     using Free = py::call_guard<py::gil_scoped_release>;
-    py::class_<FusedField>(module, "FusedField")
-        .def(py::init<int, int, const std::string&, int>(), py::arg("width"), py::arg("embedding"),
+    py::class_<FusedField> field(module, "FusedField");
+    field        .def(py::init<int, int, const std::string&, int>(), py::arg("width"), py::arg("embedding"),
              py::arg("isa") = "auto", py::arg("threads") = 1)
         .def_property_readonly("width", [](const FusedField& f) { return f.shape().width; })
         .def_property_readonly("embedding", [](const FusedField& f) { return f.shape().embedding; })
@@ -200,6 +150,7 @@ PYBIND11_MODULE(_kernel, module) {
              py::arg("want_points") = true)
         .def("adam_step", adam_step, py::arg("learning_rate"), py::arg("beta1") = 0.9f,
              py::arg("beta2") = 0.99f, py::arg("epsilon") = 1e-8f, py::arg("encoding_scale") = 1.0f);
+    bind_rays(module, field);
 }
 
 }  // namespace meslam

@@ -88,11 +88,10 @@ void FusedField::reset_optimizer() {
     step_ = 0;
 }
 
-// task(thread, first sample, samples). Each thread has a fixed range of blocks, so that the order
-// of its sums does not depend on timing.
-void FusedField::for_each_block(size_t count,
+// task(thread, first, number) for blocks of at most `block` items. Each thread has a fixed range of
+// blocks, so that the order of its sums does not depend on timing.
+void FusedField::for_each_block(size_t count, size_t block,
                                 const std::function<void(int, size_t, int)>& task) {
-    const size_t block = static_cast<size_t>(backend_->block);
     const size_t blocks = (count + block - 1) / block;
     const size_t threads = static_cast<size_t>(pool_.threads());
     const auto work = [&](int thread) {
@@ -115,7 +114,7 @@ void FusedField::for_each_block(size_t count,
 
 void FusedField::forward(const float* points, size_t count, float* values) {
     const Lock lock(mutex_);
-    for_each_block(count, [&](int thread, size_t first, int samples) {
+    for_each_block(count, static_cast<size_t>(backend_->block), [&](int thread, size_t first, int samples) {
         backend_->forward(shape_, packed_.data(), workspaces_[thread].data(), points + 3 * first,
                           samples, Keep::kNothing, values + 4 * first);
     });
@@ -124,6 +123,11 @@ void FusedField::forward(const float* points, size_t count, float* values) {
 void FusedField::forward_with_gradient(const float* points, size_t count, float* values,
                                        float* grad_distance, float* grad_luma) {
     const Lock lock(mutex_);
+    evaluate_with_gradient(points, count, values, grad_distance, grad_luma);
+}
+
+void FusedField::evaluate_with_gradient(const float* points, size_t count, float* values,
+                                        float* grad_distance, float* grad_luma) {
     AlignedArray<float> seeds(8 * static_cast<size_t>(backend_->block));
     float* const distance_seed = seeds.data();
     float* const luma_seed = distance_seed + 4 * backend_->block;
@@ -131,7 +135,7 @@ void FusedField::forward_with_gradient(const float* points, size_t count, float*
         distance_seed[4 * s] = 1.0f;
         copy(kLuma, 3, luma_seed + 4 * s + 1);
     }
-    for_each_block(count, [&](int thread, size_t first, int samples) {
+    for_each_block(count, static_cast<size_t>(backend_->block), [&](int thread, size_t first, int samples) {
         void* const workspace = workspaces_[thread].data();
         backend_->forward(shape_, packed_.data(), workspace, points + 3 * first, samples,
                           Keep::kSlopes, values + 4 * first);
@@ -149,7 +153,7 @@ void FusedField::backward(const float* points, size_t count, const float* grad_v
     const Lock lock(mutex_);
     uncollected_ = true;
     AlignedArray<float> values(4 * static_cast<size_t>(backend_->block * pool_.threads()));
-    for_each_block(count, [&](int thread, size_t first, int samples) {
+    for_each_block(count, static_cast<size_t>(backend_->block), [&](int thread, size_t first, int samples) {
         void* const workspace = workspaces_[thread].data();
         backend_->forward(shape_, packed_.data(), workspace, points + 3 * first, samples,
                           Keep::kAll, values.data() + 4 * thread * backend_->block);
@@ -157,6 +161,90 @@ void FusedField::backward(const float* points, size_t count, const float* grad_v
                            grad_points == nullptr ? nullptr : grad_points + 3 * first,
                            accumulators_[thread].data());
     });
+}
+
+// values, differentiate() from values to grad_values, and back. Where the samples fit into one
+// block, what the forward pass kept serves the backward pass; else it is repeated.
+void FusedField::train_samples(int thread, int count, const float* points, float* values,
+                               float* grad_values, float* grad_points,
+                               const std::function<void()>& differentiate) {
+    void* const workspace = workspaces_[thread].data();
+    const int block = backend_->block;
+    const bool once = count <= block;
+    const auto forward = [&](int first, Keep keep) {
+        backend_->forward(shape_, packed_.data(), workspace, points + 3 * first,
+                          std::min(block, count - first), keep, values + 4 * first);
+    };
+    for (int first = 0; first < count; first += block) {
+        forward(first, once ? Keep::kAll : Keep::kNothing);
+    }
+    differentiate();
+    for (int first = 0; first < count; first += block) {
+        if (!once) forward(first, Keep::kAll);
+        backend_->backward(shape_, packed_.data(), workspace, grad_values + 4 * first,
+                           std::min(block, count - first), grad_points + 3 * first,
+                           accumulators_[thread].data());
+    }
+}
+
+void FusedField::train_rays(const RaySettings& settings, const RayBatch& batch, float* losses,
+                            float* grad_origins, float* grad_directions) {
+    const Lock lock(mutex_);
+    uncollected_ = true;
+    const int samples = batch.samples;
+    const int rays_at_once = std::max(1, backend_->block / samples);
+    const size_t room = static_cast<size_t>(rays_at_once * samples);
+    AlignedArray<float> memory(14 * room * static_cast<size_t>(pool_.threads()));
+    const float mean = 1.0f / static_cast<float>(batch.rays);
+
+    for_each_block(batch.rays, rays_at_once, [&](int thread, size_t first, int rays) {
+        float* const points = memory.data() + 14 * room * thread;
+        float* const grad_points = points + 3 * room;
+        float* const values = grad_points + 3 * room;
+        float* const grad_values = values + 4 * room;
+        const float* const along = batch.along + first * samples;
+        for (int i = 0; i < rays * samples; ++i) {
+            const size_t ray = 3 * (first + i / samples);
+            for (int axis = 0; axis < 3; ++axis) {
+                points[3 * i + axis] =
+                    batch.origins[ray + axis] + along[i] * batch.directions[ray + axis];
+            }
+        }
+        train_samples(thread, rays * samples, points, values, grad_values, grad_points, [&] {
+            for (int i = 0; i < rays; ++i) {
+                const size_t ray = first + i;
+                const float weight = batch.weights == nullptr ? 1.0f : batch.weights[ray];
+                ray_losses(settings, {batch.distances[ray], batch.colors + 3 * ray}, samples,
+                           along + i * samples, values + 4 * i * samples, weight * mean,
+                           losses + 3 * ray, grad_values + 4 * i * samples);
+            }
+        });
+        std::fill_n(grad_origins + 3 * first, 3 * rays, 0.0f);
+        std::fill_n(grad_directions + 3 * first, 3 * rays, 0.0f);
+        for (int i = 0; i < rays * samples; ++i) {
+            const size_t ray = 3 * (first + i / samples);
+            for (int axis = 0; axis < 3; ++axis) {
+                grad_origins[ray + axis] += grad_points[3 * i + axis];
+                grad_directions[ray + axis] += along[i] * grad_points[3 * i + axis];
+            }
+        }
+    });
+}
+
+void FusedField::normal_equations(const AlignmentSettings& settings, const float* points,
+                                  AlignmentPoints measured, double* information, double* gradient,
+                                  float* distance, bool* usable) {
+    const Lock lock(mutex_);
+    const size_t count = measured.count;
+    AlignedArray<float> memory(10 * count);
+    float* const values = memory.data();
+    float* const grad_distance = values + 4 * count;
+    float* const grad_luma = settings.color_weight > 0.0 ? grad_distance + 3 * count : nullptr;
+    evaluate_with_gradient(points, count, values, grad_distance, grad_luma);
+    measured.values = values;
+    measured.grad_distance = grad_distance;
+    measured.grad_luma = grad_luma;
+    meslam::normal_equations(settings, measured, information, gradient, distance, usable);
 }
 
 void FusedField::collect_gradients() {

@@ -7,7 +7,9 @@
 #include <vector>
 
 #include "aligned_array.hpp"
+#include "alignment.hpp"
 #include "backend.hpp"
+#include "ray_losses.hpp"
 #include "thread_pool.hpp"
 
 namespace meslam {
@@ -19,6 +21,18 @@ struct AdamOptions {
     float epsilon;
     // Factor on the learning rate of B and phi.
     float encoding_scale;
+};
+
+// Rays in region coordinates with their samples; what lies at a sample is origin + along * direction.
+struct RayBatch {
+    size_t rays;
+    int samples;
+    const float* origins;     // (rays,3)
+    const float* directions;  // (rays,3): change of region coordinates a metre
+    const float* distances;   // (rays): of the measured surface [m]
+    const float* colors;      // (rays,3): measured, in [0, 1]
+    const float* along;       // (rays,samples): ascending [m]
+    const float* weights;     // (rays): factors on the rays' losses; null for ones
 };
 
 // Calls from several threads are safe and follow one another. Results depend on the number of
@@ -48,12 +62,27 @@ public:
     // Repeats the forward pass block by block, adds to the gradients, writes grad_points (count,3)
     // unless it is null.
     void backward(const float* points, size_t count, const float* grad_values, float* grad_points);
+    // Forward pass, rendering, losses and backward pass of rays in one go. The gradients are those of
+    // the mean over the rays of weight times loss. Writes losses (rays,3), before the weights, and
+    // grad_origins and grad_directions (rays,3).
+    void train_rays(const RaySettings& settings, const RayBatch& batch, float* losses,
+                    float* grad_origins, float* grad_directions);
+    // See alignment.hpp; `measured` needs no values and gradients: they are computed at points.
+    void normal_equations(const AlignmentSettings& settings, const float* points,
+                          AlignmentPoints measured, double* information, double* gradient,
+                          float* distance, bool* usable);
     // One step with the gradients of the backward calls, which it uses up. False, and nothing
     // changed, where they are not finite.
     bool adam_step(const AdamOptions& options);
 
 private:
-    void for_each_block(size_t count, const std::function<void(int, size_t, int)>& task);
+    void for_each_block(size_t count, size_t block,
+                        const std::function<void(int, size_t, int)>& task);
+    void evaluate_with_gradient(const float* points, size_t count, float* values,
+                                float* grad_distance, float* grad_luma);
+    void train_samples(int thread, int count, const float* points, float* values,
+                       float* grad_values, float* grad_points,
+                       const std::function<void()>& differentiate);
     void collect_gradients();
 
     const Backend* const backend_;

@@ -2,8 +2,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 _Floats = NDArray[np.float32]
+_Doubles = NDArray[np.float64]
 
 def available_isas() -> list[str]: ...
+
+class RaySettings:
+    def __init__(
+        self,
+        *,
+        density_scale: float,
+        truncation: float,
+        surface_offset: float,
+        distance_weight: float,
+        depth_weight: float,
+        color_weight: float,
+        depth_clip: float,
+    ) -> None: ...
 
 class FusedField:
     def __init__(self, width: int, embedding: int, isa: str = "auto", threads: int = 1) -> None: ...
@@ -41,3 +55,27 @@ class FusedField:
         epsilon: float = 1e-8,
         encoding_scale: float = 1.0,
     ) -> bool: ...
+    def train_rays(
+        self,
+        settings: RaySettings,
+        origins: _Floats,
+        directions: _Floats,
+        distances: _Floats,
+        colors: _Floats,
+        along: _Floats,
+        weights: _Floats | None = None,
+    ) -> tuple[_Floats, _Floats, _Floats]: ...
+    def normal_equations(
+        self,
+        points: _Floats,
+        arms: _Floats,
+        luma: _Floats,
+        weights: _Floats,
+        *,
+        to_map: _Doubles,
+        surface_level: float,
+        saturation: float,
+        min_slope: float,
+        huber: float,
+        color_weight: float,
+    ) -> tuple[_Doubles, _Doubles, _Floats, NDArray[np.bool_]]: ...

@@ -7,16 +7,18 @@ found at run time; the environment variable MESLAM_KERNEL_ISA caps the choice.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from meslam_core.config import FieldConfig
+from meslam_core.config import FieldConfig, MappingConfig
 from meslam_core.errors import ConfigError
 from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON
 from meslam_core.field.network import FieldNetwork
+from meslam_core.field.rendering import surface_offset_m
 
 _import_error = ""
 try:
@@ -62,6 +64,45 @@ def available_isas() -> tuple[str, ...]:
         return tuple(_kernel.available_isas())
     except ValueError as error:
         raise ConfigError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """How residuals of a frame against the field are formed and weighted.
+
+    Attributes:
+        to_map: (3, 3) float64; a gradient (row) by region coordinates times it is one by map
+            coordinates [1/m].
+        surface_level: f on the surface.
+        saturation: points with |f| from this on are not used.
+        min_slope: nor are those where f is flatter [1/m].
+        huber_m: robust threshold [m].
+        color_weight: scale of the colour residual; 0 switches it off.
+    """
+
+    to_map: NDArray[np.float64]
+    surface_level: float
+    saturation: float
+    min_slope: float
+    huber_m: float
+    color_weight: float
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Of (translation [m], rotation [rad]) about the camera centre, map axes.
+
+    Attributes:
+        information: (6, 6) float64, the weighted sum of J^T J.
+        gradient: (6,) float64, the weighted sum of J^T residual.
+        distance_m: (N,) float32, from the mapped surface, positive behind it.
+        usable: (N,) which points took part.
+    """
+
+    information: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    distance_m: Floats
+    usable: NDArray[np.bool_]
 
 
 class KernelField:
@@ -112,6 +153,78 @@ class KernelField:
         )
         assert luma is not None
         return values, distance, luma
+
+    def train_rays(
+        self,
+        origins: Floats,
+        directions: Floats,
+        distances_m: Floats,
+        colors: Floats,
+        along_m: Floats,
+        mapping: MappingConfig,
+        weights: Floats | None = None,
+    ) -> tuple[Floats, Floats, Floats]:
+        """Samples, values, rendering, `mapping.losses.ray_losses` and the way back in one pass.
+
+        Adds the gradients of the mean loss over the rays to the field's own; `step` uses them.
+
+        Args:
+            origins: (R, 3) region coordinates.
+            directions: (R, 3) change of region coordinates along the ray [1/m].
+            distances_m: (R,) of the measured surface along the ray.
+            colors: (R, 3) measured, in [0, 1].
+            along_m: (R, S) ascending distances of the samples along the ray.
+            mapping: weights of the losses.
+            weights: (R,) factors on the rays' losses; ones by default.
+
+        Returns:
+            Weighted losses (R, 3): signed distance, rendered depth, rendered colour, before the
+            rays' own weights; and the gradients (R, 3) of the mean by origins and by directions.
+        """
+        settings = _kernel.RaySettings(
+            density_scale=self.config.density_scale,
+            truncation=self.config.truncation_m,
+            surface_offset=surface_offset_m(self.config),
+            distance_weight=mapping.distance_weight,
+            depth_weight=mapping.depth_weight,
+            color_weight=mapping.color_weight,
+            depth_clip=mapping.depth_clip_m,
+        )
+        return self.fused.train_rays(
+            settings, origins, directions, distances_m, colors, along_m, weights
+        )
+
+    def normal_equations(
+        self,
+        points: Floats,
+        arms_m: Floats,
+        luma: Floats,
+        weights: Floats,
+        settings: AlignmentSettings,
+    ) -> NormalEquations:
+        """Gauss-Newton's equations of measured surface points against the field.
+
+        Args:
+            points: (N, 3) region coordinates.
+            arms_m: (N, 3) from the camera centre to the points, map axes.
+            luma: (N,) measured at the points.
+            weights: (N,); a point with weight 0 is not used.
+            settings: of the residuals.
+        """
+        return NormalEquations(
+            *self.fused.normal_equations(
+                points,
+                arms_m,
+                luma,
+                weights,
+                to_map=settings.to_map,
+                surface_level=settings.surface_level,
+                saturation=settings.saturation,
+                min_slope=settings.min_slope,
+                huber=settings.huber_m,
+                color_weight=settings.color_weight,
+            )
+        )
 
     def flat(self) -> Floats:
         """Copy of the weights in the layout of `network.parameter_shapes`."""

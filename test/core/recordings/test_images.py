@@ -113,6 +113,7 @@ def test_compressed_depth_of_floats_is_inverse_depth() -> None:
     depth = depth_from_message(compressed("32FC1; compressedDepth png", data))
     assert depth[0, 0] == 0
     # Half a step of inverse depth: z^2 / (2 A).
+    assert depth.dtype == np.float32
     error = np.abs(depth - metres).reshape(-1)[1:]
     assert (error <= metres.reshape(-1)[1:] ** 2 / (2 * quant_a) + 1e-4).all()
 

@@ -87,7 +87,9 @@ def test_the_current_frame_is_learnt_too(build_room):
     lengths = ends.norm(dim=1)
     wall = Rays(ends / lengths[:, None], lengths, torch.full((500, 3), 0.5))
     optimizer.train(room.region, 150, wall, pose, refine_poses=False)
-    on_wall = (ends @ torch.from_numpy(pose[:3, :3]).float().T + torch.from_numpy(pose[:3, 3])).float()
+    on_wall = (
+        ends @ torch.from_numpy(pose[:3, :3]).float().T + torch.from_numpy(pose[:3, 3])
+    ).float()
     before_wall = on_wall - 0.08 * (wall.directions @ torch.from_numpy(pose[:3, :3]).float().T)
     values = [
         room.region.field.predict(room.region.to_region(points).numpy())[:, 0]

@@ -24,6 +24,8 @@ WIDE_ITERATIONS = (20, 20, 10, 1, 0)
 WIDE_DISTANCE_FACTOR = 3.0
 COLORED_ITERATIONS = 50
 NORMAL_NEIGHBORS = 20
+DEPTH_HUBER_M = 0.05
+RESIDUAL_STRIDE = 16
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,21 @@ def _reduced(
     return color, np.where(usable, depth, np.float32(0.0)), camera
 
 
+@dataclass(frozen=True)
+class PreparedImages:
+    """A frame as the hybrid method wants it, and what its quality is judged by."""
+
+    image: Any
+    intrinsics: Any
+    depth_m: NDArray[np.float32]
+    camera: PinholeCamera
+
+    @property
+    def measured_share(self) -> float:
+        """Share of pixels with depth."""
+        return float(np.mean(self.depth_m > 0))
+
+
 class HybridRegistrar:
     """Open3D's RGB-D odometry with photometric and geometric terms on an image pyramid."""
 
@@ -94,18 +111,18 @@ class HybridRegistrar:
         self._odometry = odometry
         self._sensor = sensor
 
-    def prepare(self, frame: RgbdFrame) -> tuple[Any, Any, float]:
+    def prepare(self, frame: RgbdFrame) -> PreparedImages:
         color, depth, camera = _reduced(frame, self._odometry, self._sensor)
         image = o3d.t.geometry.RGBDImage(
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color))),
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth))),
         )
-        return image, o3d.core.Tensor(camera.matrix), float(np.mean(depth > 0))
+        return PreparedImages(image, o3d.core.Tensor(camera.matrix), depth, camera)
 
     def register(
         self,
-        source: tuple[Any, Any, float],
-        target: tuple[Any, Any, float],
+        source: PreparedImages,
+        target: PreparedImages,
         T_target_source: Pose,
         *,
         wide: bool = False,
@@ -118,40 +135,56 @@ class HybridRegistrar:
         result = self._hybrid(source, target, T_target_source, limit, HYBRID_ITERATIONS)
         odometry = o3d.t.pipelines.odometry
         information = odometry.compute_odometry_information_matrix(
-            source[0].depth,
-            target[0].depth,
-            source[1],
+            source.image.depth,
+            target.image.depth,
+            source.intrinsics,
             result.transformation,
             limit,
             1.0,
             self._sensor.max_depth_m,
         )
         # Open3D counts correspondences among all pixels; a D435 measures only half of them.
-        fitness = min(1.0, result.fitness / max(source[2], 1e-3))
-        return Registration(
-            result.transformation.numpy(), information.numpy(), fitness, result.inlier_rmse
-        )
+        fitness = min(1.0, result.fitness / max(source.measured_share, 1e-3))
+        transformation = result.transformation.numpy()
+        residual_m = depth_residual_m(source, target, transformation, limit)
+        return Registration(transformation, information.numpy(), fitness, residual_m)
 
     def _hybrid(
         self,
-        source: tuple[Any, Any, float],
-        target: tuple[Any, Any, float],
+        source: PreparedImages,
+        target: PreparedImages,
         T_target_source: Pose,
         limit_m: float,
         iterations: tuple[int, ...],
     ) -> Any:
         odometry = o3d.t.pipelines.odometry
         return odometry.rgbd_odometry_multi_scale(
-            source[0],
-            target[0],
-            source[1],
+            source.image,
+            target.image,
+            source.intrinsics,
             o3d.core.Tensor(T_target_source),
             1.0,
             self._sensor.max_depth_m,
             [odometry.OdometryConvergenceCriteria(n, 1e-6, 1e-6) for n in iterations],
             odometry.Method.Hybrid,
-            odometry.OdometryLossParams(limit_m),
+            odometry.OdometryLossParams(limit_m, min(DEPTH_HUBER_M, limit_m)),
         )
+
+
+def depth_residual_m(
+    source: PreparedImages, target: PreparedImages, T_target_source: Pose, limit_m: float
+) -> float:
+    """RMS difference [m] of the depths that correspond; Open3D's own is in no metric unit."""
+    rows, columns = np.nonzero(source.depth_m)
+    rows, columns = rows[::RESIDUAL_STRIDE], columns[::RESIDUAL_STRIDE]
+    points = source.camera.ray_directions(columns, rows) * source.depth_m[rows, columns][:, None]
+    u, v, z = target.camera.project(points @ T_target_source[:3, :3].T + T_target_source[:3, 3])
+    seen = (z > 0) & (u > -0.5) & (u < target.camera.width - 0.5)
+    seen &= (v > -0.5) & (v < target.camera.height - 0.5)
+    measured = target.depth_m[np.rint(v[seen]).astype(int), np.rint(u[seen]).astype(int)]
+    difference = (z[seen] - measured)[measured > 0]
+    difference = difference[np.abs(difference) < limit_m]
+    return float(np.sqrt(np.mean(difference**2))) if len(difference) else float("inf")
 
 
 class ColoredIcpRegistrar:
@@ -167,6 +200,8 @@ class ColoredIcpRegistrar:
         points = camera.ray_directions(columns, rows) * depth[rows, columns][:, None]
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
         cloud.colors = o3d.utility.Vector3dVector(color[rows, columns] / 255.0)
+        if not len(points):
+            return cloud
         cloud = cloud.voxel_down_sample(self._odometry.voxel_size_m)
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBORS))
         cloud.orient_normals_towards_camera_location()

@@ -24,6 +24,7 @@ def test_each_image_is_used_once_and_the_closest_pair_wins() -> None:
 
 def test_tolerance_is_exclusive_as_in_the_benchmark() -> None:
     assert pair_stamps(stamps(0), stamps(20)) == []
+    assert pair_stamps(stamps(20), stamps(0)) == []
     assert pair_stamps(stamps(0), stamps(19.999)) == [(0, 0)]
 
 

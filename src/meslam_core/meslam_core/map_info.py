@@ -16,12 +16,18 @@ def describe_map(path: Path) -> tuple[dict[str, Any], list[str]]:
         MapError: when there is no map, or nothing of it can be read.
     """
     loaded = MapStore(path).load()
-    low, high = NeuralMap(loaded.regions).bounds if loaded.regions else ([0.0] * 3, [0.0] * 3)
+    low, high, volume_m3 = [0.0] * 3, [0.0] * 3, 0.0
+    if loaded.regions:
+        neural_map = NeuralMap(loaded.regions)
+        (low, high), volume_m3 = neural_map.bounds.tolist(), neural_map.observed_volume_m3
+    size = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
     facts = {
         "format": "map store",
         "map_id": loaded.map_id,
         "regions": len(loaded.regions),
-        "bytes": sum(file.stat().st_size for file in path.rglob("*") if file.is_file()),
+        "bytes": size,
+        "observed_volume_m3": volume_m3,
+        "bytes_per_m3": size / volume_m3 if volume_m3 else 0.0,
         "region_side_m": float(loaded.grid.side_m),
         "region_overlap": float(loaded.grid.overlap),
         "lattice_origin_m": [float(value) for value in loaded.grid.origin],

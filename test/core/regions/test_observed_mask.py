@@ -116,4 +116,3 @@ def test_a_keyframe_is_marked_in_real_time() -> None:
         mask.integrate(np.zeros(3), directions, distances, TRUNCATION_M)
         fastest = min(fastest, time.thread_time() - started)
     assert fastest < 0.030
-    print(f"{fastest * 1e3:.1f} ms")

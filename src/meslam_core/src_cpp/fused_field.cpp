@@ -16,6 +16,36 @@ constexpr float kLuma[3] = {0.299f, 0.587f, 0.114f};
 
 void copy(const float* from, size_t count, float* to) { std::copy(from, from + count, to); }
 
+// points (rays * samples,3) of the rays from `first` on.
+void place_samples(const RayBatch& batch, size_t first, int rays, float* points) {
+    for (size_t ray = first; ray < first + rays; ++ray) {
+        const float* const along = batch.along + ray * batch.samples;
+        for (int i = 0; i < batch.samples; ++i, points += 3) {
+            for (int axis = 0; axis < 3; ++axis) {
+                points[axis] =
+                    batch.origins[3 * ray + axis] + along[i] * batch.directions[3 * ray + axis];
+            }
+        }
+    }
+}
+
+// The way back: gradients of the points to gradients of the rays.
+void gather_rays(const RayBatch& batch, size_t first, int rays, const float* grad_points,
+                 float* grad_origins, float* grad_directions) {
+    for (size_t ray = first; ray < first + rays; ++ray) {
+        const float* const along = batch.along + ray * batch.samples;
+        float origin[3] = {}, direction[3] = {};
+        for (int i = 0; i < batch.samples; ++i, grad_points += 3) {
+            for (int axis = 0; axis < 3; ++axis) {
+                origin[axis] += grad_points[axis];
+                direction[axis] += along[i] * grad_points[axis];
+            }
+        }
+        copy(origin, 3, grad_origins + 3 * ray);
+        copy(direction, 3, grad_directions + 3 * ray);
+    }
+}
+
 }  // namespace
 
 FusedField::FusedField(int width, int embedding, const std::string& isa, int threads)
@@ -203,13 +233,7 @@ void FusedField::train_rays(const RaySettings& settings, const RayBatch& batch, 
         float* const values = grad_points + 3 * room;
         float* const grad_values = values + 4 * room;
         const float* const along = batch.along + first * samples;
-        for (int i = 0; i < rays * samples; ++i) {
-            const size_t ray = 3 * (first + i / samples);
-            for (int axis = 0; axis < 3; ++axis) {
-                points[3 * i + axis] =
-                    batch.origins[ray + axis] + along[i] * batch.directions[ray + axis];
-            }
-        }
+        place_samples(batch, first, rays, points);
         train_samples(thread, rays * samples, points, values, grad_values, grad_points, [&] {
             for (int i = 0; i < rays; ++i) {
                 const size_t ray = first + i;
@@ -219,16 +243,24 @@ void FusedField::train_rays(const RaySettings& settings, const RayBatch& batch, 
                            losses + 3 * ray, grad_values + 4 * i * samples);
             }
         });
-        std::fill_n(grad_origins + 3 * first, 3 * rays, 0.0f);
-        std::fill_n(grad_directions + 3 * first, 3 * rays, 0.0f);
-        for (int i = 0; i < rays * samples; ++i) {
-            const size_t ray = 3 * (first + i / samples);
-            for (int axis = 0; axis < 3; ++axis) {
-                grad_origins[ray + axis] += grad_points[3 * i + axis];
-                grad_directions[ray + axis] += along[i] * grad_points[3 * i + axis];
-            }
-        }
+        gather_rays(batch, first, rays, grad_points, grad_origins, grad_directions);
     });
+}
+
+void FusedField::train_posed_rays(const RaySettings& settings, const SamplingSettings& sampling,
+                                  uint64_t seed, const PosedRays& rays, float* losses,
+                                  float* grad_twists) {
+    const RegionRays placed = to_region(rays);
+    const int samples = sampling.free_samples + sampling.surface_samples;
+    std::vector<float> along(rays.rays * samples);
+    sample_rays(sampling, seed, rays.rays, rays.distances, along.data());
+    std::vector<float> gradients(6 * rays.rays);
+    float* const grad_directions = gradients.data() + 3 * rays.rays;
+    train_rays(settings,
+               {rays.rays, samples, placed.origins.data(), placed.directions.data(), rays.distances,
+                rays.colors, along.data(), rays.weights},
+               losses, gradients.data(), grad_directions);
+    twist_gradients(rays, gradients.data(), grad_directions, grad_twists);
 }
 
 void FusedField::normal_equations(const AlignmentSettings& settings, const float* points,

@@ -9,7 +9,9 @@
 #include "aligned_array.hpp"
 #include "alignment.hpp"
 #include "backend.hpp"
+#include "posed_rays.hpp"
 #include "ray_losses.hpp"
+#include "ray_sampling.hpp"
 #include "thread_pool.hpp"
 
 namespace meslam {
@@ -67,6 +69,11 @@ public:
     // grad_origins and grad_directions (rays,3).
     void train_rays(const RaySettings& settings, const RayBatch& batch, float* losses,
                     float* grad_origins, float* grad_directions);
+    // The same from cameras' poses, with samples drawn here; writes losses (rays,3) and grad_twists
+    // (poses,6), see posed_rays.hpp.
+    void train_posed_rays(const RaySettings& settings, const SamplingSettings& sampling,
+                          uint64_t seed, const PosedRays& rays, float* losses,
+                          float* grad_twists);
     // See alignment.hpp; `measured` needs no values and gradients: they are computed at points.
     void normal_equations(const AlignmentSettings& settings, const float* points,
                           AlignmentPoints measured, double* information, double* gradient,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from meslam_core.config import FieldConfig, MappingConfig
 from meslam_core.field import kernel
+from meslam_core.field.alignment import AlignmentSettings
 from meslam_core.field.network import FieldNetwork
 from meslam_core.field.rendering import render, surface_level
 from meslam_core.field.sampling import sample_distances
@@ -124,6 +125,89 @@ def test_rays_with_more_samples_than_a_block(isa: str) -> None:
     assert error(field.fused.gradients(), exact[3]) < 2 * tolerance(isa)
 
 
+def test_samples_are_distributed_as_the_reference_has_them() -> None:
+    rng = np.random.default_rng(0)
+    distances = rng.uniform(0.5, 4.0, 4000).astype(np.float32)
+    generator = torch.Generator().manual_seed(0)
+    expected = sample_distances(torch.from_numpy(distances), MAPPING, generator).numpy()
+    actual = kernel.sample_rays(distances, MAPPING, seed=7)
+    assert actual.shape == expected.shape
+    assert (np.diff(actual, axis=1) >= 0).all()
+    np.testing.assert_array_equal(actual, kernel.sample_rays(distances, MAPPING, seed=7))
+    assert (actual != kernel.sample_rays(distances, MAPPING, seed=8)).mean() > 0.99
+    # Quantiles of every sample, as shares of the ray and as offsets from the surface.
+    for shown in (lambda x: x / distances[:, None], lambda x: x - distances[:, None]):
+        levels = np.linspace(0.05, 0.95, 10)
+        ours, theirs = (np.quantile(shown(x), levels, axis=0) for x in (actual, expected))
+        np.testing.assert_allclose(ours, theirs, atol=0.05 * np.ptp(theirs, axis=0).max())
+    near = np.abs(actual - distances[:, None])[:, MAPPING.free_samples :]
+    assert near.mean() == pytest.approx(0.8 * MAPPING.surface_sigma_m, rel=0.1)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_posed_rays_are_rays_with_poses(threads: int) -> None:
+    """Against `train_rays` in region coordinates, the twists through torch."""
+    field = trained_field(FieldConfig(), "portable", threads)
+    rng = np.random.default_rng(5)
+    count, poses = 120, 4
+    rays = Rays(count)
+    directions = rays.directions / np.linalg.norm(rays.directions, axis=1, keepdims=True)
+    rotations = np.stack([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(poses)])
+    translations = rng.normal(size=(poses, 3)) * 0.3
+    pose = rng.integers(poses, size=count)
+    affine = np.concatenate(
+        [np.linalg.qr(rng.normal(size=(3, 3)))[0] / 1.5, [[0.1], [0.2], [0]]], 1
+    )
+    losses, grad_twists = field.train_posed_rays(
+        rotations.astype(np.float32),
+        translations.astype(np.float32),
+        pose,
+        directions,
+        rays.distances,
+        rays.colors,
+        affine.astype(np.float32),
+        MAPPING,
+        3,
+        rays.weights,
+    )
+    gradients = field.fused.gradients()
+    field.fused.zero_gradients()
+
+    twists = torch.zeros(poses, 6, dtype=torch.float64, requires_grad=True)
+    linear = torch.tensor(affine[:, :3])
+    in_map = torch.tensor(np.einsum("rij,rj->ri", rotations[pose], directions))
+    in_map = in_map + torch.linalg.cross(twists[pose, 3:], in_map)
+    origins = torch.tensor(translations)[pose] + twists[pose, :3]
+    placed = origins @ linear.T + torch.tensor(affine[:, 3]), in_map @ linear.T
+    expected, grad_origins, grad_directions = field.train_rays(
+        *(x.detach().float().numpy() for x in placed),
+        rays.distances,
+        rays.colors,
+        kernel.sample_rays(rays.distances, MAPPING, seed=3),
+        MAPPING,
+        rays.weights,
+    )
+    torch.autograd.backward(placed, [torch.tensor(g) for g in (grad_origins, grad_directions)])
+    np.testing.assert_allclose(losses, expected, rtol=1e-3, atol=1e-4)
+    assert error(grad_twists, twists.grad.numpy()) < 1e-3
+    assert error(gradients, field.fused.gradients()) < 1e-3
+
+
+def test_poses_are_checked() -> None:
+    field = trained_field(FieldConfig(), "auto")
+    rays = Rays(5)
+    rotations, translations = np.zeros((2, 3, 3), np.float32), np.zeros((2, 3), np.float32)
+    rest = (rays.directions, rays.distances, rays.colors, np.eye(3, 4, dtype=np.float32))
+    with pytest.raises(IndexError, match=r"pose\[4\] is 2, but there are 2 poses"):
+        field.train_posed_rays(
+            rotations, translations, np.array([0, 1, 0, 1, 2]), *rest, MAPPING, seed=0
+        )
+    with pytest.raises(ValueError, match="int64"):
+        field.train_posed_rays(
+            rotations, translations, np.zeros(5, np.int32), *rest, MAPPING, seed=0
+        )
+
+
 def test_no_rays() -> None:
     field = trained_field(FieldConfig(), "auto")
     losses, grad_origins, _ = field.train_rays(*Rays(0).arrays(), MAPPING)
@@ -187,7 +271,7 @@ def test_normal_equations(isa: str, color_weight: float) -> None:
     weights = rng.uniform(0.0, 1.5, count).astype(np.float32)
     weights[::7] = 0.0
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    equations = kernel.AlignmentSettings(
+    equations = AlignmentSettings(
         to_map=rotation / 1.5,
         surface_level=surface_level(config),
         saturation=0.95,

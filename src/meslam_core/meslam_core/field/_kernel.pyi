@@ -19,6 +19,13 @@ class RaySettings:
         depth_clip: float,
     ) -> None: ...
 
+class SamplingSettings:
+    def __init__(
+        self, *, free_samples: int, surface_samples: int, surface_sigma: float
+    ) -> None: ...
+
+def sample_rays(settings: SamplingSettings, seed: int, distances: _Floats) -> _Floats: ...
+
 class FusedField:
     def __init__(self, width: int, embedding: int, isa: str = "auto", threads: int = 1) -> None: ...
     @property
@@ -65,6 +72,20 @@ class FusedField:
         along: _Floats,
         weights: _Floats | None = None,
     ) -> tuple[_Floats, _Floats, _Floats]: ...
+    def train_posed_rays(
+        self,
+        settings: RaySettings,
+        sampling: SamplingSettings,
+        seed: int,
+        rotations: _Floats,
+        translations: _Floats,
+        pose: NDArray[np.int64],
+        directions: _Floats,
+        distances: _Floats,
+        colors: _Floats,
+        to_region: _Floats,
+        weights: _Floats | None = None,
+    ) -> tuple[_Floats, _Floats]: ...
     def normal_equations(
         self,
         points: _Floats,

@@ -7,7 +7,6 @@ found at run time; the environment variable MESLAM_KERNEL_ISA caps the choice.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from meslam_core.config import FieldConfig, MappingConfig
 from meslam_core.errors import ConfigError
+from meslam_core.field.alignment import AlignmentSettings, NormalEquations
 from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON
 from meslam_core.field.network import FieldNetwork
 from meslam_core.field.rendering import surface_offset_m
@@ -66,43 +66,35 @@ def available_isas() -> tuple[str, ...]:
         raise ConfigError(str(error)) from error
 
 
-@dataclass(frozen=True)
-class AlignmentSettings:
-    """How residuals of a frame against the field are formed and weighted.
+def sample_rays(distances_m: Floats, mapping: MappingConfig, seed: int) -> Floats:
+    """Ascending distances (R, S) along rays, distributed as `sampling.sample_distances` has them.
 
-    Attributes:
-        to_map: (3, 3) float64; a gradient (row) by region coordinates times it is one by map
-            coordinates [1/m].
-        surface_level: f on the surface.
-        saturation: points with |f| from this on are not used.
-        min_slope: nor are those where f is flatter [1/m].
-        huber_m: robust threshold [m].
-        color_weight: scale of the colour residual; 0 switches it off.
+    Args:
+        distances_m: (R,) of the measured surface along the ray.
+        mapping: numbers of samples and their spread.
+        seed: of the random numbers; a ray's depend on it and on the ray's number alone.
     """
-
-    to_map: NDArray[np.float64]
-    surface_level: float
-    saturation: float
-    min_slope: float
-    huber_m: float
-    color_weight: float
+    return _kernel.sample_rays(_sampling_settings(mapping), seed, distances_m)
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    """Of (translation [m], rotation [rad]) about the camera centre, map axes.
+def _sampling_settings(mapping: MappingConfig) -> _kernel.SamplingSettings:
+    return _kernel.SamplingSettings(
+        free_samples=mapping.free_samples,
+        surface_samples=mapping.surface_samples,
+        surface_sigma=mapping.surface_sigma_m,
+    )
 
-    Attributes:
-        information: (6, 6) float64, the weighted sum of J^T J.
-        gradient: (6,) float64, the weighted sum of J^T residual.
-        distance_m: (N,) float32, from the mapped surface, positive behind it.
-        usable: (N,) which points took part.
-    """
 
-    information: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    distance_m: Floats
-    usable: NDArray[np.bool_]
+def _ray_settings(config: FieldConfig, mapping: MappingConfig) -> _kernel.RaySettings:
+    return _kernel.RaySettings(
+        density_scale=config.density_scale,
+        truncation=config.truncation_m,
+        surface_offset=surface_offset_m(config),
+        distance_weight=mapping.distance_weight,
+        depth_weight=mapping.depth_weight,
+        color_weight=mapping.color_weight,
+        depth_clip=mapping.depth_clip_m,
+    )
 
 
 class KernelField:
@@ -181,17 +173,59 @@ class KernelField:
             Weighted losses (R, 3): signed distance, rendered depth, rendered colour, before the
             rays' own weights; and the gradients (R, 3) of the mean by origins and by directions.
         """
-        settings = _kernel.RaySettings(
-            density_scale=self.config.density_scale,
-            truncation=self.config.truncation_m,
-            surface_offset=surface_offset_m(self.config),
-            distance_weight=mapping.distance_weight,
-            depth_weight=mapping.depth_weight,
-            color_weight=mapping.color_weight,
-            depth_clip=mapping.depth_clip_m,
-        )
         return self.fused.train_rays(
-            settings, origins, directions, distances_m, colors, along_m, weights
+            _ray_settings(self.config, mapping),
+            origins,
+            directions,
+            distances_m,
+            colors,
+            along_m,
+            weights,
+        )
+
+    def train_posed_rays(
+        self,
+        rotations: Floats,
+        translations: Floats,
+        pose: NDArray[np.int64],
+        directions: Floats,
+        distances_m: Floats,
+        colors: Floats,
+        to_region: Floats,
+        mapping: MappingConfig,
+        seed: int,
+        weights: Floats | None = None,
+    ) -> tuple[Floats, Floats]:
+        """`train_rays` of rays in their cameras' frames, at samples drawn by `sample_rays`.
+
+        Args:
+            rotations, translations: (P, 3, 3) and (P, 3) T_map_camera of the cameras [m].
+            pose: (R,) int64, number of each ray's camera.
+            directions: (R, 3) unit vectors, camera frame.
+            distances_m: (R,) of the measured surface along the ray.
+            colors: (R, 3) measured, in [0, 1].
+            to_region: (3, 4) from the map frame [m] to region coordinates.
+            mapping: numbers of samples, weights of the losses.
+            seed: of the samples; another one for every step.
+            weights: (R,) factors on the rays' losses; ones by default.
+
+        Returns:
+            Weighted losses (R, 3) as `train_rays` has them; and the gradients (P, 6) of the mean
+            by small moves (translation [m], rotation [rad]) of the cameras about their centres,
+            map axes.
+        """
+        return self.fused.train_posed_rays(
+            _ray_settings(self.config, mapping),
+            _sampling_settings(mapping),
+            seed,
+            rotations,
+            translations,
+            pose,
+            directions,
+            distances_m,
+            colors,
+            to_region,
+            weights,
         )
 
     def normal_equations(

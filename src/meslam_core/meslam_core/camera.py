@@ -132,23 +132,32 @@ def register_depth_to_color(
     Returns:
         (H, W) float32 depth in the colour camera [m], 0 where nothing projects.
     """
-    points = depth_camera.back_project(depth_m).reshape(-1, 3)
-    points = points[points[:, 2] > 0].astype(np.float64)
-    points = points @ np.asarray(T_color_depth)[:3, :3].T + np.asarray(T_color_depth)[:3, 3]
-    u, v, z = color_camera.project(points)
+    rotation = np.asarray(T_color_depth, np.float32)[:3, :3]
+    translation = np.asarray(T_color_depth, np.float32)[:3, 3]
+    # Rays are a sum of a row's and a column's part: no (h, w, 3) array is needed.
+    columns = (np.arange(depth_camera.width) - depth_camera.cx) / depth_camera.fx
+    rows = (np.arange(depth_camera.height) - depth_camera.cy) / depth_camera.fy
+    x, y, z = (
+        depth_m * (axis[0] * columns + (axis[1] * rows + axis[2])[:, None]).astype(np.float32)
+        + offset
+        for axis, offset in zip(rotation, translation, strict=True)
+    )
+    seen = (depth_m > 0) & (z > 0)
+    z = z[seen]
+    u = x[seen] / z * np.float32(color_camera.fx) + np.float32(color_camera.cx)
+    v = y[seen] / z * np.float32(color_camera.fy) + np.float32(color_camera.cy)
     # A pixel of a coarser depth image covers several of a finer colour image.
     half_u = 0.5 * color_camera.fx / depth_camera.fx
     half_v = 0.5 * color_camera.fy / depth_camera.fy
+    u_first = np.floor(u - np.float32(half_u - 1)).astype(np.int32)
+    v_first = np.floor(v - np.float32(half_v - 1)).astype(np.int32)
     registered = np.full(color_camera.width * color_camera.height, np.inf, np.float32)
-    steps_u = range(int(np.ceil(2 * half_u)))
-    steps_v = range(int(np.ceil(2 * half_v)))
-    u_first, v_first = np.floor(u - half_u + 1), np.floor(v - half_v + 1)
-    for step_v in steps_v:
-        for step_u in steps_u:
+    for step_v in range(int(np.ceil(2 * half_v))):
+        for step_u in range(int(np.ceil(2 * half_u))):
             column, row = u_first + step_u, v_first + step_v
             inside = (column >= 0) & (column < color_camera.width)
-            inside &= (row >= 0) & (row < color_camera.height) & (z > 0)
-            index = (row[inside] * color_camera.width + column[inside]).astype(np.int64)
-            np.minimum.at(registered, index, z[inside].astype(np.float32))
+            inside &= (row >= 0) & (row < color_camera.height)
+            index = row[inside] * color_camera.width + column[inside]
+            np.minimum.at(registered, index, z[inside])
     registered[~np.isfinite(registered)] = 0.0
     return registered.reshape(color_camera.height, color_camera.width)

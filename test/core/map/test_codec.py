@@ -241,9 +241,7 @@ def test_data_behind_the_compressed_frame(small_region: StoredRegion) -> None:
         ("extra", np.zeros(3, np.float32)),
     ],
 )
-def test_lying_tensors(
-    small_region: StoredRegion, name: str, tensor: np.ndarray | None
-) -> None:
+def test_lying_tensors(small_region: StoredRegion, name: str, tensor: np.ndarray | None) -> None:
     tensors, metadata = content_of(codec.encode(small_region))
     tensors.pop(name, None)
     if tensor is not None:

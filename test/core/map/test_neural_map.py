@@ -46,9 +46,7 @@ def test_signed_distance_is_positive_behind_surfaces(
     assert (distance[truth < -0.2] < -0.08).mean() > 0.995
 
 
-def test_occupancy_of_the_sphere_and_the_room(
-    neural_map: NeuralMap, scene: SphereInRoom
-) -> None:
+def test_occupancy_of_the_sphere_and_the_room(neural_map: NeuralMap, scene: SphereInRoom) -> None:
     points = room_points(scene)
     truth = scene.distance_m(points)
     state, probability = neural_map.occupancy(points)
@@ -132,9 +130,7 @@ def test_weights_fall_exponentially_with_the_distance_to_the_centre() -> None:
         [constant_region(0.0, centers[0]), constant_region(1.0, centers[1], (1, 0, 0))], config
     )
     points = np.random.default_rng(5).uniform([-0.5, -1, -1], [2.9, 1, 1], (50, 3))
-    weights = np.exp(
-        [-np.linalg.norm(points - center, axis=1) / (0.4 * 1.5) for center in centers]
-    )
+    weights = np.exp([-np.linalg.norm(points - center, axis=1) / (0.4 * 1.5) for center in centers])
     expected = weights[1] / weights.sum(axis=0)
     assert np.allclose(blended.values(points).distance, expected, atol=5e-3)
     middle = np.array([[1.2, 0.0, 0.0]])

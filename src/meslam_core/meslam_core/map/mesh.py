@@ -116,8 +116,7 @@ def _tiles(blocks: NDArray[np.int64]) -> dict[Block, NDArray[np.int64]]:
     tiles, member = np.unique(blocks // TILE_BLOCKS, axis=0, return_inverse=True)
     member = member.reshape(-1)
     return {
-        (int(x), int(y), int(z)): blocks[member == number]
-        for number, (x, y, z) in enumerate(tiles)
+        (int(x), int(y), int(z)): blocks[member == number] for number, (x, y, z) in enumerate(tiles)
     }
 
 
@@ -136,7 +135,7 @@ class _Builder:
         self._chosen = chosen
         self._resolution = resolution
         self._mask_voxel_m = min(region.stored.mask.voxel_m for region in chosen)
-        self._edges: list[NDArray[np.int64]] = []
+        self._shared: list[NDArray[np.int64]] = []
         self._triangles: list[NDArray[np.int64]] = []
         self._parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]] = []
         self._count = 0
@@ -180,9 +179,7 @@ class _Builder:
         field[tuple(lattice.T)] = np.where(self._near(points, answer.flags), values, np.nan)
         return field
 
-    def _crossed(
-        self, field: NDArray[np.float32], cells: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+    def _crossed(self, field: NDArray[np.float32], cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which coarse cells the surface may cross, judged by the values at their corners.
 
         No point of a cell is farther from a corner than half its diagonal; where every corner
@@ -199,9 +196,7 @@ class _Builder:
         crossed: NDArray[np.bool_] = cells & before & behind
         return crossed
 
-    def _near(
-        self, points: NDArray[np.floating], flags: NDArray[np.uint8]
-    ) -> NDArray[np.bool_]:
+    def _near(self, points: NDArray[np.floating], flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which points (N, 3) a chosen region saw near a surface; `flags` are any region's."""
         if self._all:
             return flags & NEAR_SURFACE > 0
@@ -230,9 +225,11 @@ class _Builder:
         except (ValueError, RuntimeError):  # no cell holds a surface
             return
         vertices = vertices.astype(np.float64)
-        self._edges.append(_edge_keys(vertices, first))
+        shared = np.flatnonzero(_on_face(vertices, field.shape[0] - 1))
+        edges = _edge_numbers(vertices[shared], first)
+        self._shared.append(np.stack([edges, shared + self._count]))
         # skimage winds them clockwise seen from the lower values, which are free space.
-        self._triangles.append(triangles[:, ::-1].astype(np.int64) + self._count)
+        self._triangles.append(triangles[:, ::-1].astype(np.int32) + np.int32(self._count))
         self._count += len(vertices)
         self._parts.append(self._finished((vertices + first) * self._resolution))
 
@@ -254,19 +251,21 @@ class _Builder:
         """All tiles' meshes as one, vertices on shared edges joined."""
         if not self._parts:
             return TriangleMesh(
-                np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32),
-                np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8),
+                np.zeros((0, 3), np.float32),
+                np.zeros((0, 3), np.int32),
+                np.zeros((0, 3), np.float32),
+                np.zeros((0, 3), np.uint8),
             )
-        edges = np.concatenate(self._edges)
-        inner = np.flatnonzero(edges < 0)
-        edges[inner] = -1 - inner
-        _, kept, number = np.unique(edges, return_index=True, return_inverse=True)
-        columns = zip(*self._parts, strict=True)
-        vertices, normals, colors = (np.concatenate(column)[kept] for column in columns)
-        triangles = number[np.concatenate(self._triangles)].astype(np.int32)
+        edges, shared = np.concatenate(self._shared, axis=1)
+        _, first, number = np.unique(edges, return_index=True, return_inverse=True)
+        joined = np.arange(self._count, dtype=np.int32)
+        joined[shared] = shared[first][number]
+        triangles = joined[np.concatenate(self._triangles)]
         a, b, c = triangles.T
         proper = (a != b) & (b != c) & (c != a)
-        return TriangleMesh(vertices, triangles[proper], normals, colors)
+        columns = zip(*self._parts, strict=True)
+        vertices, normals, colors = (np.concatenate(column) for column in columns)
+        return TriangleMesh(vertices, triangles, normals, colors).selected(proper)
 
 
 def _enlarged(cells: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
@@ -275,23 +274,24 @@ def _enlarged(cells: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
     return result
 
 
-def _edge_keys(vertices: NDArray[np.float64], first: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The lattice edge each vertex of a tile lies on, the same number in every tile.
+def _on_face(vertices: NDArray[np.float64], side: int) -> NDArray[np.bool_]:
+    """Which vertices (V, 3) of a tile lie on its faces, where other tiles have them too."""
+    margin = 0.25 * MIN_MARGIN
+    outermost = (vertices < margin) | (vertices > side - margin)
+    return np.asarray(outermost.any(axis=1), np.bool_)
 
-    Marching cubes also makes vertices inside cells; no other tile has those, and their number
-    is -1.
+
+def _edge_numbers(vertices: NDArray[np.float64], first: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The lattice edge each vertex lies on, the same number in every tile.
 
     Args:
-        vertices: (V, 3) lattice steps from `first`.
+        vertices: (V, 3) on lattice edges, in lattice steps from `first`.
         first: (3,) lattice point of the tile's lowest corner.
     """
     nearest = np.rint(vertices)
-    off = np.abs(vertices - nearest)
-    axis = off.argmax(axis=1)
+    axis = np.abs(vertices - nearest).argmax(axis=1)
     rows = np.arange(len(vertices))
     lower = nearest.astype(np.int64) + first
     lower[rows, axis] = np.floor(vertices[rows, axis]).astype(np.int64) + first[axis]
     x, y, z = (lower + LATTICE_REACH).T
-    keys = (((x * 2 * LATTICE_REACH + y) * 2 * LATTICE_REACH) + z) * 3 + axis
-    on_edge = np.sort(off, axis=1)[:, 1] < 0.25 * MIN_MARGIN
-    return np.where(on_edge, keys, -1)
+    return np.asarray((((x * 2 * LATTICE_REACH + y) * 2 * LATTICE_REACH) + z) * 3 + axis)

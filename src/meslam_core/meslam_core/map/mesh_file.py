@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 FORMATS = (".ply", ".glb", ".obj")
 
-_PLY_VERTEX = np.dtype(
-    [("position", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)]
-)
+_PLY_VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)])
 _PLY_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 
 
@@ -100,7 +98,8 @@ def _write_glb(mesh: TriangleMesh, file: BinaryIO) -> None:
         )
         start += part.nbytes
     accessors[1] |= {
-        "min": mesh.vertices.min(axis=0).tolist(), "max": mesh.vertices.max(axis=0).tolist()
+        "min": mesh.vertices.min(axis=0).tolist(),
+        "max": mesh.vertices.max(axis=0).tolist(),
     }
     attributes = {"POSITION": 1, "NORMAL": 2, "COLOR_0": 3}
     document: dict[str, Any] = {

@@ -125,6 +125,8 @@ class MapStore:
         map_id = map_id or (previous.map_id if previous else uuid.uuid4().hex)
         manifest = Manifest(map_id, grid, tuple(entries.values()), nodes)
         write_atomically(self.path / MANIFEST, manifest.to_bytes())
+        current = set(manifest.regions)
+        self._written = {key: e for key, e in self._written.items() if e in current}
         self._clean(manifest, previous)
         return map_id
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+BATCH = 1 << 18
+
 
 @dataclass(frozen=True)
 class TriangleMesh:
@@ -29,10 +31,13 @@ class TriangleMesh:
     @property
     def triangle_areas_m2(self) -> NDArray[np.float64]:
         """Area (T,) of every triangle [m^2]."""
-        corners = self.vertices.astype(np.float64)[self.triangles]
-        edges = corners[:, 1:] - corners[:, :1]
-        doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-        return np.asarray(0.5 * doubled, np.float64)
+        areas = np.empty(len(self.triangles))
+        for start in range(0, len(areas), BATCH):
+            corners = self.vertices[self.triangles[start : start + BATCH]].astype(np.float64)
+            edges = corners[:, 1:] - corners[:, :1]
+            doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+            areas[start : start + BATCH] = 0.5 * doubled
+        return areas
 
     def selected(self, triangles: NDArray[np.bool_]) -> TriangleMesh:
         """The mesh of some of the triangles (T,), without vertices that none of them uses."""

@@ -2,10 +2,10 @@
 
     python benchmarks/kernel_throughput.py
 
-Times a training step of 8800 points (values, gradients of weights, embedding and points, Adam)
-and inference. Every variant runs in a process of its own, several rounds in turn; the shortest
-time counts, since other work on the machine only ever adds. Writes a table, JSON and a plot to
-docs/benchmarks/kernel_throughput.*.
+Times inference and a training step of mapping: 880 rays of 10 samples, from values over rendering
+and losses to the gradients of weights, embedding, phases and rays, and Adam. Every variant runs in
+a process of its own, several rounds in turn; the shortest time counts, since other work on the
+machine only ever adds. Writes a table, JSON and a plot to docs/benchmarks/kernel_throughput.*.
 """
 
 from __future__ import annotations
@@ -28,16 +28,21 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from meslam_core.config import FieldConfig
+from meslam_core.config import FieldConfig, MappingConfig
 from meslam_core.field.kernel import KernelField, available_isas
 from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON
 from meslam_core.field.network import FieldNetwork
+from meslam_core.field.rendering import render
+from meslam_core.field.sampling import sample_distances
+from meslam_core.mapping.losses import ray_losses
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 
 WIDTHS = (64, 128, 256)
-STEP_POINTS = 8800
+RAYS = 880
+MAPPING = MappingConfig(free_samples=5, surface_samples=5)
+STEP_POINTS = RAYS * (MAPPING.free_samples + MAPPING.surface_samples)
 INFERENCE_POINTS = 100_000
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "benchmarks"
 # What keeps each of torch's libraries from using more than AVX2.
@@ -107,19 +112,45 @@ def random_points(count: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-1.0, 1.0, (count, 3)).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class Rays:
+    """Rays in region coordinates with their samples, as `KernelField.train_rays` takes them."""
+
+    origins: torch.Tensor
+    directions: torch.Tensor
+    distances_m: torch.Tensor
+    colors: torch.Tensor
+    along_m: torch.Tensor
+
+
+def random_rays() -> Rays:
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(RAYS, 3, generator=generator)) / 1.5
+    distances = torch.rand(RAYS, generator=generator) * 2 + 0.5
+    return Rays(
+        origins=torch.rand(RAYS, 3, generator=generator) * 0.2,
+        directions=directions,
+        distances_m=distances,
+        colors=torch.rand(RAYS, 3, generator=generator),
+        along_m=sample_distances(distances, MAPPING, generator),
+    )
+
+
 def time_kernel(variant: Variant, config: FieldConfig, seconds: float) -> tuple[float, float]:
     """Times of a step and of inference [s]."""
-    fused = KernelField(config, isa=variant.isa, threads=variant.threads).fused
-    points = random_points(STEP_POINTS)
-    gradient = np.full((STEP_POINTS, 4), 1e-4, np.float32)
+    field = KernelField(config, isa=variant.isa, threads=variant.threads)
+    rays = random_rays()
+    arrays = [
+        tensor.numpy()
+        for tensor in (rays.origins, rays.directions, rays.distances_m, rays.colors, rays.along_m)
+    ]
 
     def step() -> None:
-        fused.forward(points)
-        fused.backward(points, gradient)
-        fused.adam_step(1e-6, *ADAM_BETAS, ADAM_EPSILON)
+        field.train_rays(*arrays, MAPPING)
+        field.step(1e-6)
 
     many = random_points(INFERENCE_POINTS)
-    return shortest(step, seconds), shortest(lambda: fused.forward(many), seconds / 2)
+    return shortest(step, seconds), shortest(lambda: field.predict(many), seconds / 2)
 
 
 def time_torch(variant: Variant, config: FieldConfig, seconds: float) -> tuple[float, float]:
@@ -129,8 +160,9 @@ def time_torch(variant: Variant, config: FieldConfig, seconds: float) -> tuple[f
     optimizer = torch.optim.Adam(
         network.parameters(), lr=1e-6, betas=ADAM_BETAS, eps=ADAM_EPSILON, fused=True
     )
-    points = torch.from_numpy(random_points(STEP_POINTS)).requires_grad_(True)
-    gradient = torch.full((STEP_POINTS, 4), 1e-4)
+    rays = random_rays()
+    origins = rays.origins.clone().requires_grad_(True)
+    directions = rays.directions.clone().requires_grad_(True)
 
     def values(inputs: torch.Tensor) -> torch.Tensor:
         # The angles of the embedding stay in single precision; bfloat16 would destroy them.
@@ -145,10 +177,22 @@ def time_torch(variant: Variant, config: FieldConfig, seconds: float) -> tuple[f
         return torch.cat([output[:, :1], torch.sigmoid(output[:, 1:])], dim=-1)
 
     def step() -> None:
-        values(points).backward(gradient)
+        points = origins[:, None] + rays.along_m[..., None] * directions[:, None]
+        outputs = values(points.reshape(-1, 3)).reshape(RAYS, -1, 4)
+        rendering = render(outputs[..., 0], outputs[..., 1:], rays.along_m, config)
+        losses = ray_losses(
+            outputs[..., 0],
+            rays.along_m,
+            rendering,
+            rays.distances_m,
+            rays.colors,
+            config,
+            MAPPING,
+        )
+        losses.total.mean().backward()
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
-        points.grad = None
+        origins.grad = directions.grad = None
 
     many = torch.from_numpy(random_points(INFERENCE_POINTS))
 
@@ -260,7 +304,7 @@ def plot(timings: Sequence[Timing], path: Path) -> None:
 
 def write_table(table: Table, ratios: dict[str, float], path: Path) -> None:
     with path.open("w") as file:
-        console = Console(file=file, width=120)
+        console = Console(file=file, width=140)
         file.write("Made by `python benchmarks/kernel_throughput.py`\n\n")
         file.write(f"{machine()}\n\n")
         console.print(table)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from data.memory_recording import MemoryRecording
 from data.textured_room import frame_at, path
 from hypothesis import settings
 
@@ -14,15 +16,17 @@ from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.mapping.joint_optimizer import JointOptimizer
 from meslam_core.mapping.keyframes import KeyframeStore, rays_at
+from meslam_core.pipeline import RunOptions, RunOutcome, run
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose
+from meslam_core.threads import limit_threads
 from meslam_core.tracking.pixels import trusted_pixels
+from meslam_core.trajectory import Trajectory, write_tum
 
 settings.register_profile("deterministic", derandomize=True, deadline=None, database=None)
 settings.load_profile("deterministic")
-# Two threads that wait for each other on a busy machine are many times slower than one.
-torch.set_num_threads(1)
+limit_threads(1)
 
 TRAINING_STEPS = 700
 
@@ -54,6 +58,15 @@ class MappedRoom:
         return self.frames[number]
 
 
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run's folder, the truth it was compared with, and its outcome."""
+
+    out: Path
+    truth: Path
+    outcome: RunOutcome
+
+
 @pytest.fixture(scope="session")
 def build_room():
     """Builds a `MappedRoom`; for tests that change what they are given."""
@@ -83,3 +96,47 @@ def build_room():
 def mapped_room(build_room) -> MappedRoom:
     """A converged map; must not be changed."""
     return build_room(TRAINING_STEPS)
+
+
+QUICK = (
+    "keyframes.rays=2048",
+    "mapping.first_iterations=150",
+    "mapping.iterations=8",
+    "mapping.keyframe_iterations=16",
+    "mapping.final_iterations=60",
+    "regions.mask_extent=2.0",
+)
+"""Overrides that make a run short and still accurate to centimetres in the textured room."""
+
+
+@pytest.fixture(scope="session")
+def quick_config() -> MeslamConfig:
+    """A configuration for runs of a few frames."""
+    return MeslamConfig.from_overrides(QUICK)
+
+
+@pytest.fixture(scope="session")
+def room_poses() -> list[Pose]:
+    """True poses of `room_frames`; the first is where a map begins."""
+    return path(16, step_m=0.02, step_deg=1.0)
+
+
+@pytest.fixture(scope="session")
+def room_frames(room_poses) -> list[RgbdFrame]:
+    """A short walk through the textured room."""
+    return [frame_at(pose, number) for number, pose in enumerate(room_poses)]
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory, quick_config, room_poses, room_frames) -> FinishedRun:
+    """The results of a whole run; must not be changed."""
+    folder = tmp_path_factory.mktemp("run")
+    stamps = np.array([frame.stamp_ns for frame in room_frames])
+    write_tum(folder / "truth.txt", Trajectory(stamps, np.array(room_poses)))
+    outcome = run(
+        MemoryRecording(room_frames),
+        quick_config,
+        folder / "out",
+        RunOptions(truth=folder / "truth.txt"),
+    )
+    return FinishedRun(folder / "out", folder / "truth.txt", outcome)

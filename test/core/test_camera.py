@@ -77,6 +77,13 @@ def test_camera_json_says_what_it_should_hold(tmp_path, text):
         PinholeCamera.from_json(file)
 
 
+def test_unusable_intrinsics_name_their_file(tmp_path):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(CAMERA.to_dict() | {"fy": 0}))
+    with pytest.raises(FrameError, match=r"camera\.json.*unusable"):
+        PinholeCamera.from_json(file)
+
+
 def test_missing_camera_json_is_named(tmp_path):
     with pytest.raises(FrameError, match=r"nowhere\.json"):
         PinholeCamera.from_json(tmp_path / "nowhere.json")

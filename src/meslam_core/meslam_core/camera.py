@@ -100,7 +100,7 @@ class PinholeCamera:
         """Read a `camera.json` with width, height, fx, fy, cx, cy.
 
         Raises:
-            FrameError: when the file is unreadable or a key is missing.
+            FrameError: when the file is unreadable, a key is missing or a value is unusable.
         """
         try:
             values = json.loads(Path(path).read_text())
@@ -109,6 +109,8 @@ class PinholeCamera:
                 height=int(values["height"]),
                 **{key: float(values[key]) for key in ("fx", "fy", "cx", "cy")},
             )
+        except FrameError as error:
+            raise FrameError(f"{path}: {error}") from error
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise FrameError(
                 f"{path} is not a camera description ({error!r}); "

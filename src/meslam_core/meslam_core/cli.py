@@ -141,6 +141,9 @@ def run(
     config = MeslamConfig.from_overrides(overrides or [], preset)
     chosen = _frame_range(frames)
     intrinsics = _camera(camera)
+    from meslam_core.threads import limit_threads
+
+    limit_threads(config.runtime.threads)
     from meslam_core import pipeline
     from meslam_core.console import RunBar, error_console
     from meslam_core.recordings import open_recording

@@ -400,7 +400,10 @@ class MeslamConfig:
             section, dot, name = path.strip().partition(".")
             if not equals or not dot:
                 raise ConfigError(f"{text!r} is not of the form section.name=value")
-            values.setdefault(section, {})[name] = _parsed(value)
+            try:
+                values.setdefault(section, {})[name] = _parsed(value)
+            except yaml.YAMLError as error:
+                raise ConfigError(f"the value of {text!r} is neither number nor text") from error
         return cls.from_mapping(values)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:

@@ -12,8 +12,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
-import torch
-
 from meslam_core.config import MeslamConfig
 from meslam_core.errors import EvaluationError, FrameError, RecordingError
 from meslam_core.evaluation.report import truth_entries
@@ -25,6 +23,7 @@ from meslam_core.recordings.recording import Recording
 from meslam_core.results import MAP, ONLINE_TRAJECTORY, TRAJECTORY, ResultFolder
 from meslam_core.run_report import Tally, map_entries, run_environment
 from meslam_core.slam import FrameResult, Slam, TrackingState
+from meslam_core.threads import limit_threads
 from meslam_core.trajectory import Trajectory, read_tum, write_tum
 
 
@@ -123,7 +122,7 @@ def run(
         RecordingError, FrameError: when not a single frame can be read.
     """
     options, progress = options or RunOptions(), progress or Silent()
-    torch.set_num_threads(config.runtime.threads)
+    limit_threads(config.runtime.threads)
     truth = None if options.truth is None else read_tum(options.truth)
     with ResultFolder(out_dir) as results:
         slam = Slam(config, options.seed)

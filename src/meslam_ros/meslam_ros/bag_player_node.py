@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.qos import ReliabilityPolicy
@@ -55,8 +56,8 @@ class PlaybackStoppedError(Exception):
 class BagPlayerNode(ManagedNode):
     """Publishes colour, depth, camera_info, /clock and the camera's static transform."""
 
-    def __init__(self) -> None:
-        super().__init__("bag_player_node")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("bag_player_node", **options)
         self._settings = declare_settings(self, PlayerSettings)
 
     def configure(self) -> None:

@@ -32,6 +32,9 @@ class FrameConsumer(Protocol):
     def process(self, frame: RgbdFrame, mount: CameraMount, pair: ImagePair) -> None:
         """Compute with the next frame."""
 
+    def refuse(self, pair: ImagePair, reason: str) -> None:
+        """Take note of a pair that cannot be used."""
+
     def idle(self, silence_s: float) -> None:
         """No pair has come for a while [s]; called again and again until one does."""
 
@@ -132,6 +135,7 @@ class FrameWorker:
         except FrameError as error:
             self.input.dropped["unusable images"] += 1
             self._node.get_logger().error(str(error), throttle_duration_sec=WARNING_PERIOD_S)
+            self._consumer.refuse(pair, str(error))
             return
         if mount is not None:
             self._consumer.process(frame, mount, pair)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from typing import Any
 
 import torch
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -38,8 +39,8 @@ EXECUTOR_THREADS = 4
 class MapServerNode(ManagedNode):
     """Collects region models and serves the map; long answers do not hold up short ones."""
 
-    def __init__(self) -> None:
-        super().__init__("map_server_node")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("map_server_node", **options)
         self._frames = declare_settings(self, MapFrameSettings)
         self._settings = declare_settings(self, MapServerSettings)
         self._config = declare_config(self, ("regions", "map", "runtime"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import Any
 
 import torch
 from nav_msgs.msg import Odometry
@@ -27,8 +28,8 @@ from meslam_ros.transforms import CameraMount, TransformBroadcaster
 class OdometryNode(ManagedNode):
     """Estimates the base's motion from image to image."""
 
-    def __init__(self) -> None:
-        super().__init__("odometry_node")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("odometry_node", **options)
         self._frames = declare_settings(self, FrameSettings)
         self._inputs = declare_settings(self, InputSettings)
         self._config = declare_config(self, ("sensor", "odometry", "runtime"))
@@ -84,6 +85,9 @@ class OdometryNode(ManagedNode):
                 f"odometry is not to be trusted: {estimate.reason}",
                 throttle_duration_sec=WARNING_PERIOD_S,
             )
+
+    def refuse(self, pair: ImagePair, reason: str) -> None:
+        """Nothing to publish without a frame (`FrameConsumer`)."""
 
     def idle(self, silence_s: float) -> None:
         """Nothing to do without images (`FrameConsumer`)."""

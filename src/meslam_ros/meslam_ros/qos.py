@@ -20,6 +20,7 @@ STREAM = QoSProfile(depth=50)
 """Reliable results a frame: poses, status, odometry."""
 
 
+UNKNOWN_NODES = {"_NODE_NAME_UNKNOWN_": "a node not known yet"}
 MODELS_DEPTH = 1000
 """Regions that may arrive at once at a late subscriber."""
 
@@ -55,7 +56,7 @@ def describe(publishers: list[TopicEndpointInfo]) -> str:
     if not publishers:
         return "no publisher"
     offers = sorted(
-        f"{p.node_name} ({p.qos_profile.reliability.name.lower().replace('_', ' ')})"
+        f"{UNKNOWN_NODES.get(p.node_name, p.node_name)} ({p.qos_profile.reliability.name.lower().replace('_', ' ')})"
         for p in publishers
     )
     return f"{len(offers)} publisher{'s' if len(offers) > 1 else ''}: {', '.join(offers)}"

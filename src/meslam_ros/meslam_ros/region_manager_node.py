@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -22,8 +23,8 @@ from meslam_ros.rgbd_input import STEADY
 class RegionManagerNode(ManagedNode):
     """Joins the regions' models with tracking's word on which of them work."""
 
-    def __init__(self) -> None:
-        super().__init__("region_manager_node")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("region_manager_node", **options)
         self._frames = declare_settings(self, MapFrameSettings)
         self._settings = declare_settings(self, RegionManagerSettings)
         self._config = declare_config(self, ("regions",))

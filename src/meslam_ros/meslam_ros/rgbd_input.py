@@ -25,6 +25,7 @@ from meslam_ros.qos import MatchedSubscription, describe
 from meslam_ros.transforms import BaseFrame, CameraMount, StaticTransforms
 
 GRAPH_PERIOD_S = 0.2
+INFO_TIMEOUT_S = 0.3
 SAME_INTRINSICS_PX = 0.5
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -133,6 +134,17 @@ class RgbdInput:
         return RgbdFrame(pair.stamp_ns, color_info.lens.undistort_color(color), depth_m, camera)
 
     def _calibration(self, kind: str, topic: str) -> _Calibration:
+        """The latest usable camera_info; images may arrive a moment before theirs."""
+        deadline = time.monotonic() + INFO_TIMEOUT_S
+        while True:
+            try:
+                return self._latest_calibration(kind, topic)
+            except FrameError:
+                if time.monotonic() >= deadline:
+                    raise
+                time.sleep(0.01)
+
+    def _latest_calibration(self, kind: str, topic: str) -> _Calibration:
         message = self._infos.get(kind)
         if message is None:
             raise FrameError(
@@ -162,15 +174,16 @@ class RgbdInput:
     def _registered(
         self, pair: ImagePair, depth_m: np.ndarray, camera: PinholeCamera
     ) -> np.ndarray:
-        if "depth" not in self._infos:
+        try:
+            depth_info = self._calibration("depth", self._depth_info.topic)
+        except FrameError as error:
             raise FrameError(
                 f"{self._depth.topic} has {depth_m.shape[1]}x{depth_m.shape[0]} images in the "
                 f"frame {pair.depth.header.frame_id!r}, colour is {camera.width}x{camera.height} "
-                f"in {pair.color.header.frame_id!r}, and no camera_info on "
-                f"{self._depth_info.topic} tells how to register them; start the camera with "
-                "align_depth.enable:=true, or publish it"
-            )
-        depth_info = self._calibration("depth", self._depth_info.topic)
+                f"in {pair.color.header.frame_id!r}, and they cannot be registered: {error}; "
+                "start the camera with align_depth.enable:=true, or publish the depth's "
+                "camera_info"
+            ) from error
         if depth_m.shape != (depth_info.camera.height, depth_info.camera.width):
             raise FrameError(
                 f"{self._depth.topic} has {depth_m.shape[1]}x{depth_m.shape[0]} images, its "

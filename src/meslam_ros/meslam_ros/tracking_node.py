@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import Any
 
 import torch
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -46,8 +47,8 @@ LEVELS = {TrackingState.OK: OK, TrackingState.LOST: ERROR}
 class TrackingNode(ManagedNode):
     """Runs the pipeline in a worker of its own; the executor only takes messages and answers."""
 
-    def __init__(self) -> None:
-        super().__init__("tracking_node")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("tracking_node", **options)
         self._frames = declare_settings(self, FrameSettings)
         self._inputs = declare_settings(self, InputSettings)
         self._settings = declare_settings(self, TrackingSettings)
@@ -118,6 +119,7 @@ class TrackingNode(ManagedNode):
         session = self._session
         if self._paused:
             session.discarded["paused"] += 1
+            self.refuse(pair, "paused")
             return
         odometry = self._odometry_of(frame, mount)
         result = session.process(frame, mount, odometry)
@@ -132,11 +134,23 @@ class TrackingNode(ManagedNode):
             if odometry is not None:
                 T_map_odom = result.T_map_camera @ se3.inverse(odometry.T_odom_camera)
             self._map_to_odom.update(frame.stamp_ns, T_map_odom)
-        self._publish_status(pair)
+        self._publish_status(pair, status_message(result, head))
         self._all_published = False
         self._models.offer(session.regions, frame.stamp_ns)
         if time.monotonic() >= self._path_due_s:
             self._publish_path()
+
+    def refuse(self, pair: ImagePair, reason: str) -> None:
+        """Tell that a pair was not tracked, and why (`FrameConsumer`)."""
+        result = self._session.result
+        self._publish_status(
+            pair,
+            TrackingStatus(
+                header=header(pair.stamp_ns, self._frames.map_frame),
+                state=int(result.state if result else TrackingState.INITIALISING),
+                reason=reason,
+            ),
+        )
 
     def idle(self, silence_s: float) -> None:
         """Publish what the bounded rates held back (`FrameConsumer`)."""
@@ -165,10 +179,9 @@ class TrackingNode(ManagedNode):
             )
         return odometry
 
-    def _publish_status(self, pair: ImagePair) -> None:
+    def _publish_status(self, pair: ImagePair, status: TrackingStatus) -> None:
+        """Add what the node counts to what is known of a frame, and publish it."""
         session = self._session
-        assert session.result is not None
-        status = status_message(session.result, header(pair.stamp_ns, self._frames.map_frame))
         dropped = self._worker.dropped + session.discarded
         status.map_id = session.map_id
         status.keyframes = session.keyframes

@@ -1,0 +1,440 @@
+from __future__ import annotations
+
+import array
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from data.analytic_scene import GRID, SphereInRoom, learnt_field, stored
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import OccupancyGrid
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import Marker
+
+from meslam_core.map.stored_region import StoredRegion
+from meslam_interfaces.msg import RegionIndex, RegionModel
+from meslam_interfaces.srv import (
+    ExportMap,
+    GetMesh,
+    GetOccupancyGrid,
+    ListRegions,
+    LoadMap,
+    QueryOccupancy,
+    SaveMap,
+)
+from meslam_ros import topics
+from meslam_ros.client import MeslamClient
+from meslam_ros.map_server_node import MapServerNode
+from meslam_ros.qos import STREAM, latched
+from meslam_ros.region_messages import region_model
+
+WAIT_S = 20.0
+SCENE = SphereInRoom()
+Code = ExportMap.Response
+
+
+@pytest.fixture(scope="module")
+def regions() -> list[StoredRegion]:
+    """Two neighbours that both know the sphere in the room."""
+    field = learnt_field()
+    center = GRID.center((1, 0, 0))
+    neighbour = stored(field, SCENE, (1, 0, 0), (center[0], center[1], center[2]))
+    return [stored(field, SCENE), neighbour]
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> dict[str, str]:
+    return {"export_folder": str(tmp_path / "exports"), "map_folder": str(tmp_path / "maps")}
+
+
+@pytest.fixture
+def server(start_node, folders):
+    return start_node(MapServerNode, **folders)
+
+
+def publish(client: MeslamClient, *models: RegionModel) -> None:
+    """Publish models as tracking does; the publishers live as long as the client."""
+    for model in models:
+        publisher = client.node.create_publisher(RegionModel, topics.REGION_MODELS, latched())
+        publisher.publish(model)
+
+
+def model(region: StoredRegion, map_id: str = "first") -> RegionModel:
+    return region_model(region, map_id, "map", "int8")
+
+
+def listed(client: MeslamClient) -> ListRegions.Response:
+    return client.call(ListRegions, topics.LIST_REGIONS)
+
+
+def fill(client: MeslamClient, *regions: StoredRegion) -> None:
+    """Give the server regions and wait until it has them."""
+    publish(client, *(model(region) for region in regions))
+    assert client.spin_until(lambda: len(listed(client).regions.regions) == len(regions), WAIT_S)
+
+
+def query(client: MeslamClient, points: np.ndarray, **fields) -> QueryOccupancy.Response:
+    request = QueryOccupancy.Request(
+        points=array.array("f", np.asarray(points, np.float32).reshape(-1).tolist()), **fields
+    )
+    return client.call(QueryOccupancy, topics.QUERY_OCCUPANCY, request)
+
+
+def test_empty_map_says_so(server, client, tmp_path) -> None:
+    assert listed(client).result == Code.SUCCESS
+    assert len(listed(client).regions.regions) == 0
+    calls = [
+        (ExportMap, topics.EXPORT_MAP, ExportMap.Request(path="mesh.ply")),
+        (GetMesh, topics.GET_MESH, None),
+        (GetOccupancyGrid, topics.GET_OCCUPANCY_GRID, None),
+        (SaveMap, topics.SAVE_MAP, SaveMap.Request(name="map.meslam")),
+    ]
+    for kind, name, request in calls:
+        answer = client.call(kind, name, request)
+        assert answer.result == Code.EMPTY_MAP
+        assert "nothing yet" in answer.message
+    assert query(client, [[0, 0, 0]]).result == Code.EMPTY_MAP
+    assert list(tmp_path.rglob("*.*")) == []
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
+def test_exported_mesh_opens_has_colour_and_is_true(
+    server, client, regions, folders, suffix
+) -> None:
+    fill(client, regions[0])
+    answer = client.call(
+        ExportMap,
+        topics.EXPORT_MAP,
+        ExportMap.Request(path=f"room/mesh.{suffix}", resolution_m=0.05),
+    )
+    assert answer.result == Code.SUCCESS, answer.message
+    path = Path(folders["export_folder"], "room", f"mesh.{suffix}").resolve()
+    assert answer.path == str(path)
+    assert answer.bytes == path.stat().st_size
+    mesh = o3d.io.read_triangle_mesh(str(path))
+    assert len(mesh.triangles) == answer.triangles
+    if suffix == "ply":
+        vertices = np.asarray(mesh.vertices)
+        assert np.median(np.abs(SCENE.distance_m(vertices))) < 0.02
+        ball = np.linalg.norm(vertices, axis=1) < 0.6
+        red = np.asarray(mesh.vertex_colors)[ball].mean(axis=0)
+        assert red[0] > 0.6 > 0.4 > red[1]
+
+
+def test_mesh_in_the_answer_is_the_exported_one(server, client, regions, folders) -> None:
+    fill(client, *regions)
+    request = GetMesh.Request(resolution_m=0.06)
+    answer = client.call(GetMesh, topics.GET_MESH, request)
+    exported = client.call(
+        ExportMap, topics.EXPORT_MAP, ExportMap.Request(path="mesh.ply", resolution_m=0.06)
+    )
+    assert answer.result == Code.SUCCESS
+    vertices = np.frombuffer(answer.vertices, np.float32).reshape(-1, 3)
+    triangles = np.frombuffer(answer.triangles, np.uint32).reshape(-1, 3)
+    assert (len(vertices), len(triangles)) == (exported.vertices, exported.triangles)
+    assert len(answer.colors) == 3 * len(vertices)
+    assert triangles.max() < len(vertices)
+    assert answer.header.frame_id == "map"
+
+
+def test_box_and_regions_choose_a_part(server, client, regions) -> None:
+    fill(client, *regions)
+    request = GetMesh.Request(resolution_m=0.06, use_box=True)
+    for name, value in (("box_min", -0.7), ("box_max", 0.7)):
+        corner = getattr(request, name)
+        corner.x = corner.y = corner.z = value
+    ball = client.call(GetMesh, topics.GET_MESH, request)
+    vertices = np.frombuffer(ball.vertices, np.float32).reshape(-1, 3)
+    assert np.abs(np.linalg.norm(vertices, axis=1) - SCENE.radius_m).max() < 0.1
+    one = GetMesh.Request(resolution_m=0.06, regions=[RegionIndex(index=[1, 0, 0])])
+    whole = client.call(GetMesh, topics.GET_MESH, GetMesh.Request(resolution_m=0.06))
+    part = client.call(GetMesh, topics.GET_MESH, one)
+    assert 0 < len(part.triangles) < len(whole.triangles)
+
+
+def test_occupancy_is_the_scenes(server, client, regions) -> None:
+    fill(client, *regions)
+    points = np.random.default_rng(0).uniform(-1.3, 1.3, (10_000, 3))
+    answer = query(client, points, with_color=True, with_distance=True)
+    assert answer.result == Code.SUCCESS
+    state = np.array(answer.occupancy)
+    truth = SCENE.distance_m(points)
+    clear = np.abs(truth) > 0.03
+    known = clear & (state != -1)
+    assert known.mean() > 0.8
+    assert ((state[known] == 100) == (truth[known] < 0)).mean() > 0.98
+    probability = np.frombuffer(answer.probability, np.float32)
+    assert np.isnan(probability[state == -1]).all()
+    np.testing.assert_array_equal(probability[known] > 0.5, state[known] == 100)
+    distance = np.frombuffer(answer.distances_m, np.float32)
+    near = (np.abs(truth) < 0.06) & (state != -1)
+    assert np.abs(distance[near] - truth[near]).mean() < 0.01
+    colors = np.frombuffer(answer.colors, np.uint8).reshape(-1, 3)
+    on_ball = near & (np.linalg.norm(points, axis=1) < 0.6)
+    assert colors[on_ball, 0].mean() > 150 > 100 > colors[on_ball, 1].mean()
+
+
+def test_space_nobody_saw_is_unknown(server, client, regions) -> None:
+    fill(client, regions[0])
+    answer = query(client, [[0, 0, 0], [9, 9, 9], [1.2, 0, 0]])
+    assert list(answer.occupancy) == [-1, -1, 0]
+
+
+def test_grid_shows_the_ball_and_the_room(server, client, regions) -> None:
+    fill(client, regions[0])
+    request = GetOccupancyGrid.Request(
+        resolution_m=0.05, use_heights=True, min_height_m=-0.1, max_height_m=0.1
+    )
+    answer = client.call(GetOccupancyGrid, topics.GET_OCCUPANCY_GRID, request)
+    assert answer.result == Code.SUCCESS, answer.message
+    info = answer.grid.info
+    cells = np.array(answer.grid.data).reshape(info.height, info.width)
+    origin = info.origin.position
+
+    def cell(x: float, y: float) -> int:
+        return int(
+            cells[int((y - origin.y) / info.resolution), int((x - origin.x) / info.resolution)]
+        )
+
+    assert cell(0.47, 0.0) == 100
+    assert cell(0.9, 0.3) == 0
+    assert cell(1.42, 0.0) == 100
+    assert answer.grid.header.frame_id == "map"
+
+
+def test_map_survives_saving_loading_and_a_restart(
+    start_node, server, client, regions, folders
+) -> None:
+    fill(client, *regions)
+    points = np.random.default_rng(1).uniform(-1.3, 1.3, (500, 3))
+    before = query(client, points, with_color=True)
+    saved = client.call(SaveMap, topics.SAVE_MAP, SaveMap.Request(name="room.meslam"))
+    assert saved.result == Code.SUCCESS, saved.message
+    assert saved.regions == 2
+    folder = Path(folders["map_folder"], "room.meslam")
+    assert saved.bytes == sum(file.stat().st_size for file in folder.rglob("*"))
+    server.trigger_deactivate()
+    server.trigger_cleanup()
+    assert server.start()
+    assert query(client, points).result == Code.EMPTY_MAP or listed(client).regions.regions
+    loaded = client.call(LoadMap, topics.LOAD_MAP, LoadMap.Request(name="room.meslam"))
+    assert loaded.result == Code.SUCCESS, loaded.message
+    assert (loaded.regions, loaded.map_id) == (2, "first")
+    after = query(client, points, with_color=True)
+    for field in ("occupancy", "probability", "colors"):
+        np.testing.assert_array_equal(getattr(before, field), getattr(after, field))
+
+
+def test_another_map_is_not_overwritten_by_mistake(server, client, regions) -> None:
+    fill(client, regions[0])
+    request = SaveMap.Request(name="map.meslam")
+    assert client.call(SaveMap, topics.SAVE_MAP, request).result == Code.SUCCESS
+    assert client.call(SaveMap, topics.SAVE_MAP, request).result == Code.SUCCESS
+    publish(client, model(regions[0], "second"))
+    assert client.spin_until(lambda: listed(client).regions.map_id == "second", WAIT_S)
+    refused = client.call(SaveMap, topics.SAVE_MAP, request)
+    assert refused.result == Code.INVALID_REQUEST
+    assert "overwrite" in refused.message
+    request.overwrite = True
+    assert client.call(SaveMap, topics.SAVE_MAP, request).result == Code.SUCCESS
+
+
+def test_damaged_map_is_named_and_the_rest_loads(server, client, regions, folders) -> None:
+    fill(client, *regions)
+    client.call(SaveMap, topics.SAVE_MAP, SaveMap.Request(name="map.meslam"))
+    files = sorted(Path(folders["map_folder"], "map.meslam").glob("region_*"))
+    files[0].write_bytes(files[0].read_bytes()[:-10])
+    loaded = client.call(LoadMap, topics.LOAD_MAP, LoadMap.Request(name="map.meslam"))
+    assert loaded.result == Code.SUCCESS
+    assert loaded.regions == 1
+    assert len(loaded.quarantined) == 1
+    assert "damaged" in loaded.message
+    files[1].write_bytes(b"nothing")
+    broken = client.call(LoadMap, topics.LOAD_MAP, LoadMap.Request(name="map.meslam"))
+    assert broken.result == Code.INVALID_DATA
+    assert len(listed(client).regions.regions) == 1
+
+
+def export_request(**fields) -> ExportMap.Request:
+    return ExportMap.Request(**{"path": "mesh.ply", **fields})
+
+
+def boxed(low: float, high: float) -> ExportMap.Request:
+    request = export_request(use_box=True, resolution_m=0.05)
+    for corner, value in ((request.box_min, low), (request.box_max, high)):
+        corner.x = corner.y = corner.z = value
+    return request
+
+
+NAN = float("nan")
+MALFORMED = [
+    (ExportMap, topics.EXPORT_MAP, export_request(path="/tmp/mesh.ply"), 2, "leading"),
+    (ExportMap, topics.EXPORT_MAP, export_request(path="../mesh.ply"), 2, "'..'"),
+    (ExportMap, topics.EXPORT_MAP, export_request(path="a/../../mesh.ply"), 2, "'..'"),
+    (ExportMap, topics.EXPORT_MAP, export_request(path=""), 2, "name"),
+    (ExportMap, topics.EXPORT_MAP, export_request(path="."), 2, "."),
+    (ExportMap, topics.EXPORT_MAP, export_request(path="x" * 300 + ".ply"), 2, "name"),
+    (ExportMap, topics.EXPORT_MAP, export_request(path="mesh.exe"), 2, ".ply"),
+    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=-1.0), 2, "resolution"),
+    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=NAN), 2, "resolution"),
+    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=1e-6), 2, "resolution"),
+    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=1e6), 2, "resolution"),
+    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=0.006), 6, "max_cells"),
+    (ExportMap, topics.EXPORT_MAP, boxed(1.0, -1.0), 2, "box"),
+    (ExportMap, topics.EXPORT_MAP, boxed(NAN, 1.0), 2, "box"),
+    (ExportMap, topics.EXPORT_MAP, boxed(50.0, 60.0), 7, "no surface"),
+    (
+        ExportMap,
+        topics.EXPORT_MAP,
+        export_request(regions=[RegionIndex(index=[5, 5, 5])]),
+        1,
+        "(5, 5, 5)",
+    ),
+    (SaveMap, topics.SAVE_MAP, SaveMap.Request(name="../map"), 2, "'..'"),
+    (LoadMap, topics.LOAD_MAP, LoadMap.Request(name="/etc"), 2, "leading"),
+    (LoadMap, topics.LOAD_MAP, LoadMap.Request(name="nothing.meslam"), 1, "no map"),
+    (QueryOccupancy, topics.QUERY_OCCUPANCY, QueryOccupancy.Request(), 2, "no points"),
+    (
+        QueryOccupancy,
+        topics.QUERY_OCCUPANCY,
+        QueryOccupancy.Request(points=[1.0, 2.0]),
+        2,
+        "x, y, z",
+    ),
+    (
+        QueryOccupancy,
+        topics.QUERY_OCCUPANCY,
+        QueryOccupancy.Request(points=[0.0, 0.0, 0.0, NAN, 0.0, 0.0]),
+        2,
+        "point 1",
+    ),
+    (
+        QueryOccupancy,
+        topics.QUERY_OCCUPANCY,
+        QueryOccupancy.Request(points=[0.0] * 3003),
+        6,
+        "max_points",
+    ),
+    (
+        GetOccupancyGrid,
+        topics.GET_OCCUPANCY_GRID,
+        GetOccupancyGrid.Request(use_heights=True, min_height_m=1.0, max_height_m=-1.0),
+        2,
+        "lowest first",
+    ),
+    (
+        GetOccupancyGrid,
+        topics.GET_OCCUPANCY_GRID,
+        GetOccupancyGrid.Request(resolution_m=NAN),
+        2,
+        "resolution",
+    ),
+]
+
+
+def test_malformed_requests_get_their_code_and_harm_nothing(
+    start_node, client, regions, folders, tmp_path
+) -> None:
+    start_node(MapServerNode, max_points=1000, max_cells=3_000_000, **folders)
+    fill(client, regions[0])
+    for kind, name, request, code, word in MALFORMED:
+        answer = client.call(kind, name, request)
+        assert answer.result == code, (name, request, answer.message)
+        assert word in answer.message, (name, request, answer.message)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    frame = QueryOccupancy.Request(points=[0.0, 0.0, 0.0])
+    frame.header.frame_id = "nowhere"
+    answer = client.call(QueryOccupancy, topics.QUERY_OCCUPANCY, frame)
+    assert answer.result == Code.NOT_FOUND
+    assert "nowhere" in answer.message
+    # After all that it still works.
+    assert query(client, [[1.2, 0, 0]]).result == Code.SUCCESS
+
+
+def test_folder_that_cannot_be_written_is_named(start_node, client, regions, tmp_path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    start_node(
+        MapServerNode,
+        export_folder=str(tmp_path / "file" / "x"),
+        map_folder=str(tmp_path / "file" / "y"),
+    )
+    fill(client, regions[0])
+    exported = client.call(
+        ExportMap, topics.EXPORT_MAP, ExportMap.Request(path="mesh.ply", resolution_m=0.1)
+    )
+    saved = client.call(SaveMap, topics.SAVE_MAP, SaveMap.Request(name="map"))
+    for answer in (exported, saved):
+        assert answer.result == Code.IO_ERROR
+        assert str(tmp_path / "file") in answer.message
+
+
+def damaged(kind: str, region: StoredRegion) -> RegionModel:
+    message = model(region)
+    if kind == "bytes":
+        message.data[100] ^= 1
+    elif kind == "truncated":
+        message.data = message.data[:-20]
+    elif kind == "format":
+        message.format = "meslam-region/99"
+    elif kind == "empty":
+        message.data = array.array("B")
+    elif kind == "index":
+        message.index = [3, 3, 3]
+    elif kind == "version":
+        message.version += 1
+    return message
+
+
+@pytest.mark.parametrize("kind", ["bytes", "truncated", "format", "empty", "index", "version"])
+def test_damaged_models_are_refused_and_counted(server, client, regions, capfd, kind) -> None:
+    reports: list[DiagnosticStatus] = []
+    client.node.create_subscription(
+        DiagnosticArray, topics.DIAGNOSTICS, lambda m: reports.extend(m.status), STREAM
+    )
+    fill(client, regions[0])
+    publish(client, damaged(kind, replace(regions[1], version=5)))
+    assert client.spin_until(lambda: any("refused" in report.message for report in reports), WAIT_S)
+    assert "region model refused: region [" in capfd.readouterr().err
+    assert len(listed(client).regions.regions) == 1
+    publish(client, model(replace(regions[1], version=6)))
+    assert client.spin_until(lambda: len(listed(client).regions.regions) == 2, WAIT_S)
+
+
+def test_late_server_gets_every_region_once(start_node, client, regions, folders) -> None:
+    publish(client, *(model(region) for region in regions))
+    start_node(MapServerNode, **folders)
+    assert client.spin_until(lambda: len(listed(client).regions.regions) == 2, WAIT_S)
+
+
+def test_topics_show_the_map_to_late_viewers(start_node, client, regions, folders) -> None:
+    start_node(MapServerNode, mesh_topic_resolution_m=0.1, mesh_topic_period_s=0.2, **folders)
+    fill(client, *regions)
+    meshes: dict[int, Marker] = {}
+    clouds: list[PointCloud2] = []
+    grids: list[OccupancyGrid] = []
+    subscribe = client.node.create_subscription
+    subscribe(Marker, topics.MESH, lambda m: meshes.__setitem__(m.id, m), latched(10))
+    subscribe(PointCloud2, topics.MAP_POINTS, clouds.append, latched())
+    subscribe(OccupancyGrid, topics.OCCUPANCY_GRID, grids.append, latched())
+    added = {Marker.ADD}
+    assert client.spin_until(
+        lambda: (
+            {m.action for m in meshes.values()} == added
+            and len(meshes) == 2
+            and bool(clouds)
+            and bool(grids)
+        ),
+        WAIT_S,
+    )
+    for mesh in meshes.values():
+        assert mesh.type == Marker.TRIANGLE_LIST
+        assert len(mesh.points) == len(mesh.colors) > 0
+        assert len(mesh.points) % 3 == 0
+        assert mesh.header.frame_id == "map"
+    cloud = clouds[-1]
+    rows = np.frombuffer(cloud.data, [("position", "<f4", 3), ("rgb", "<u4")])
+    assert len(rows) == cloud.width > 100
+    assert np.median(np.abs(SCENE.distance_m(rows["position"]))) < 0.02
+    assert set(np.unique(grids[-1].data)) == {-1, 0, 100}

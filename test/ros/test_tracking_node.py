@@ -1,0 +1,301 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from data.ros_camera import BASE_FRAME, OPTICAL_FRAME, CameraDriver, Messages
+from data.textured_room import frame_at, path
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.qos import ReliabilityPolicy
+from std_srvs.srv import SetBool, Trigger
+from tf2_msgs.msg import TFMessage
+
+from meslam_core.se3 import inverse
+from meslam_core.slam import T_BODY_OPTICAL
+from meslam_interfaces.msg import RegionModel, TrackingStatus
+from meslam_ros import topics
+from meslam_ros.client import MeslamClient
+from meslam_ros.conversions import NANOSECONDS, byte_array, stamp_ns, to_stamp
+from meslam_ros.odometry_node import OdometryNode
+from meslam_ros.qos import STREAM, latched
+from meslam_ros.region_messages import stored_region
+from meslam_ros.tracking_node import TrackingNode
+
+POSES = path(12)
+FAST = {
+    "mapping__first_iterations": 150,
+    "mapping__iterations": 8,
+    "mapping__keyframe_iterations": 10,
+    "keyframes__rays": 2048,
+    "model_period_s": 0.1,
+    "idle_s": 0.3,
+    "transform_timeout_s": 1.0,
+}
+ANSWER_S = 30.0
+
+
+class Camera:
+    """Sends frames and waits until tracking has answered."""
+
+    def __init__(self, client: MeslamClient, **options) -> None:
+        self._client = client
+        self._driver = CameraDriver(client.node, **options)
+
+    def wait(self, nodes: int = 1) -> None:
+        assert self._client.spin_until(lambda: self._driver.has_subscribers(nodes), ANSWER_S)
+
+    def send(self, number: int, change=lambda messages: None, later_ns: int = 0) -> None:
+        frame = frame_at(POSES[number], number)
+        object.__setattr__(frame, "stamp_ns", frame.stamp_ns + NANOSECONDS + later_ns)
+        self._driver.send(frame, change)
+
+    def track(self, number: int, later_ns: int = 0) -> TrackingStatus:
+        before = len(self._client.statuses)
+        self.send(number, later_ns=later_ns)
+        assert self._client.spin_until(lambda: len(self._client.statuses) > before, ANSWER_S)
+        return self._client.statuses[-1]
+
+
+def diagnosed(client: MeslamClient) -> list[DiagnosticStatus]:
+    """Collects what the nodes report on /diagnostics."""
+    reports: list[DiagnosticStatus] = []
+    client.node.create_subscription(
+        DiagnosticArray, topics.DIAGNOSTICS, lambda m: reports.extend(m.status), STREAM
+    )
+    return reports
+
+
+@pytest.mark.parametrize("reliability", list(ReliabilityPolicy)[1:3])
+def test_every_frame_gets_a_pose_and_the_map_a_model(start_node, client, reliability) -> None:
+    start_node(OdometryNode)
+    start_node(TrackingNode, **FAST)
+    models: list[RegionModel] = []
+    covariances: list[PoseWithCovarianceStamped] = []
+    transforms: list[TFMessage] = []
+    subscribe = client.node.create_subscription
+    subscribe(RegionModel, topics.REGION_MODELS, models.append, latched(100))
+    subscribe(PoseWithCovarianceStamped, topics.POSE_WITH_COVARIANCE, covariances.append, STREAM)
+    subscribe(TFMessage, topics.TF, transforms.append, STREAM)
+    camera = Camera(client, reliability=reliability)
+    camera.wait(nodes=2)
+    statuses = [camera.track(number) for number in range(len(POSES))]
+    assert client.spin_until(
+        lambda: len(client.poses) == len(POSES) and client.path_stamp_ns == client.last_stamp_ns,
+        ANSWER_S,
+    )
+
+    assert all(status.state == TrackingStatus.OK for status in statuses)
+    assert all(status.odometry_valid for status in statuses)
+    assert statuses[-1].frames_received == statuses[-1].frames_tracked == len(POSES)
+    assert statuses[-1].frames_dropped == 0
+    for stamp, T_map_base in client.poses.items():
+        number = round((stamp - NANOSECONDS) / 66_666_667)
+        truth = POSES[number] @ inverse(T_BODY_OPTICAL)
+        assert np.linalg.norm((inverse(truth) @ T_map_base)[:3, 3]) < 0.01
+    refined = client.refined_trajectory(T_BODY_OPTICAL)
+    assert len(refined) == len(POSES)
+
+    assert client.spin_until(lambda: bool(models), ANSWER_S)
+    last = models[-1]
+    assert last.map_id == statuses[-1].map_id
+    assert stored_region(last).index == (0, 0, 0)
+    covariance = np.array(covariances[-1].pose.covariance).reshape(6, 6)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    assert covariances[-1].header.frame_id == "map"
+
+    edges = {
+        (t.header.frame_id, t.child_frame_id) for message in transforms for t in message.transforms
+    }
+    assert edges == {("map", "odom"), ("odom", BASE_FRAME)}
+    assert_chain_gives_the_pose(client, transforms)
+
+
+def assert_chain_gives_the_pose(client: MeslamClient, transforms: list[TFMessage]) -> None:
+    """map -> odom -> base of the last frame is what /meslam/pose says."""
+    stamp = client.last_stamp_ns
+    chain = {
+        t.child_frame_id: t
+        for message in transforms
+        for t in message.transforms
+        if stamp_ns(t.header.stamp) == stamp
+    }
+    product = np.eye(4)
+    for child in ("odom", BASE_FRAME):
+        moved = chain[child].transform
+        T = np.eye(4)
+        q = moved.rotation
+        T[:3, :3] = rotation(q.x, q.y, q.z, q.w)
+        T[:3, 3] = moved.translation.x, moved.translation.y, moved.translation.z
+        product = product @ T
+    np.testing.assert_allclose(product, client.poses[stamp], atol=1e-9)
+
+
+def rotation(x: float, y: float, z: float, w: float) -> np.ndarray:
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def test_tracking_goes_on_without_odometry_and_without_a_base(start_node, client) -> None:
+    start_node(TrackingNode, **FAST)
+    camera = Camera(client, mounted=False)
+    camera.wait()
+    statuses = [camera.track(number) for number in range(4)]
+    assert all(status.state == TrackingStatus.OK for status in statuses)
+    assert not any(status.odometry_valid for status in statuses)
+    # The optical frame is the base, and looks along the map's x axis at first.
+    first = client.poses[min(client.poses)]
+    np.testing.assert_allclose(first, T_BODY_OPTICAL, atol=1e-6)
+
+
+def test_reset_and_pause(start_node, client) -> None:
+    start_node(TrackingNode, **FAST)
+    camera = Camera(client)
+    camera.wait()
+    before = camera.track(0)
+    answer = client.call(SetBool, topics.PAUSE, SetBool.Request(data=True))
+    assert answer.success
+    paused = camera.track(1)
+    assert paused.paused
+    assert paused.frames_tracked == 1
+    client.call(SetBool, topics.PAUSE, SetBool.Request(data=False))
+    going_on = camera.track(2)
+    assert going_on.map_id == before.map_id
+    assert "paused: 1" in going_on.drop_reasons
+    assert client.call(Trigger, topics.RESET).success
+    after = camera.track(3)
+    assert after.map_id != before.map_id
+    assert after.frames_tracked == 1
+
+
+def test_recording_that_starts_again_begins_a_new_map(start_node, client) -> None:
+    start_node(TrackingNode, **FAST)
+    camera = Camera(client)
+    camera.wait()
+    first = camera.track(0, later_ns=100 * NANOSECONDS)
+    again = camera.track(0)
+    assert again.map_id != first.map_id
+    assert again.state == TrackingStatus.OK
+
+
+def wrong_encoding(messages: Messages) -> None:
+    messages[1].encoding = "bayer_rggb8"
+
+
+def depth_of_another_size(messages: Messages) -> None:
+    depth = messages[2]
+    depth.width, depth.step = depth.width // 2, depth.step // 2
+    depth.data = byte_array(bytes(depth.data)[: depth.step * depth.height])
+
+
+def no_intrinsics(messages: Messages) -> None:
+    messages[0].k = np.zeros(9)
+
+
+def other_colour_size(messages: Messages) -> None:
+    messages[0].width = 999
+
+
+def unconnected_depth_frame(messages: Messages) -> None:
+    messages[2].header.frame_id = "camera_depth_optical_frame"
+
+
+def no_frame(messages: Messages) -> None:
+    messages[1].header.frame_id = messages[2].header.frame_id = ""
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (wrong_encoding, ("color/image_raw", "bayer_rggb8", "rgb8")),
+        (depth_of_another_size, ("aligned_depth_to_color", "80x120", "align_depth")),
+        (no_intrinsics, ("camera_info", "all zero")),
+        (other_colour_size, ("160x120", "999x120")),
+        (unconnected_depth_frame, ("camera_depth_optical_frame", OPTICAL_FRAME)),
+        (no_frame, ("frame_id",)),
+    ],
+)
+def test_unusable_input_is_named_and_does_no_harm(start_node, client, capfd, change, words) -> None:
+    start_node(TrackingNode, **FAST)
+    reports = diagnosed(client)
+    camera = Camera(client)
+    camera.wait()
+    camera.send(0, change)
+    assert client.spin_until(lambda: bool(client.statuses), ANSWER_S)
+    assert words[0] in client.statuses[0].reason
+    assert client.statuses[0].state == TrackingStatus.INITIALISING
+
+    def reported() -> bool:
+        return any("unusable images: 1" in report.message for report in reports)
+
+    assert client.spin_until(reported, ANSWER_S)
+    log = capfd.readouterr().err
+    assert all(word in log for word in words), log
+    # A camera_info is remembered; the next one must replace it.
+    assert camera.track(1).state == TrackingStatus.OK
+
+
+def test_silence_is_explained(start_node, client, capfd) -> None:
+    start_node(TrackingNode, input_timeout_s=0.5)
+    client.spin_until(lambda: False, 1.5)
+    log = capfd.readouterr().err
+    assert "/camera/camera/color/image_raw: no publisher" in log
+    assert "/camera/camera/color/camera_info: no publisher" in log
+    assert "remap" in log
+    driver = CameraDriver(client.node)
+    assert client.spin_until(driver.has_subscribers, ANSWER_S)
+    client.spin_until(lambda: False, 2.5)
+    log = capfd.readouterr().err
+    assert "test_client (reliable)" in log
+    assert "announced but nothing arrives" in log
+
+
+def test_depth_of_another_camera_is_registered(start_node, client) -> None:
+    """Depth with its own intrinsics and place, as a D435 without align_depth sends it."""
+    from meslam_core.camera import PinholeCamera
+    from meslam_core.se3 import exp
+    from meslam_ros.conversions import camera_to_info, depth_message
+    from meslam_ros.transforms import StaticBroadcaster
+
+    start_node(TrackingNode, **FAST)
+    depth_camera = PinholeCamera(128, 96, 100.0, 100.0, 63.5, 47.5)
+    T_color_depth = exp(np.array([0.015, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    camera = Camera(client)
+    depth_frame = "camera_depth_optical_frame"
+    kept = StaticBroadcaster(client.node, T_color_depth, OPTICAL_FRAME, depth_frame)
+    camera.wait()
+
+    def as_depth_camera(messages: Messages) -> None:
+        number = round((stamp_ns(messages[2].header.stamp) - NANOSECONDS) / 66_666_667)
+        seen = frame_at(POSES[number] @ T_color_depth, number, depth_camera)
+        stamp = to_stamp(stamp_ns(messages[2].header.stamp))
+        replaced = depth_message(seen.depth_m, "16UC1", stamp, depth_frame)
+        depth = messages[2]
+        for field in ("width", "height", "step", "data", "header"):
+            setattr(depth, field, getattr(replaced, field))
+        camera._driver.depth_info.publish(camera_to_info(depth_camera, stamp, depth_frame))
+
+    assert client.spin_until(
+        lambda: camera._driver.depth_info.get_subscription_count() > 0, ANSWER_S
+    ), kept
+    for number in range(4):
+        before = len(client.statuses)
+        camera.send(number, as_depth_camera)
+        assert client.spin_until(lambda n=before: len(client.statuses) > n, ANSWER_S)
+    assert client.statuses[-1].state == TrackingStatus.OK
+    last = client.poses[max(client.poses)] @ T_BODY_OPTICAL
+    assert np.linalg.norm((inverse(POSES[3]) @ last)[:3, 3]) < 0.02
+
+
+def test_pose_messages_carry_the_images_stamp(start_node, client) -> None:
+    start_node(TrackingNode, **FAST)
+    camera = Camera(client)
+    camera.wait()
+    status = camera.track(0)
+    assert client.spin_until(lambda: bool(client.poses), ANSWER_S)
+    assert list(client.poses) == [stamp_ns(status.header.stamp)]
+    assert status.header.frame_id == "map"

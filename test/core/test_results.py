@@ -26,9 +26,13 @@ def test_results_appear_together_when_published(tmp_path):
 
 
 def test_nothing_is_left_when_the_work_fails(tmp_path):
-    with pytest.raises(RuntimeError), ResultFolder(tmp_path / "a" / "b") as results:
-        fill(results, "half")
-        raise RuntimeError
+    def work() -> None:
+        with ResultFolder(tmp_path / "a" / "b") as results:
+            fill(results, "half")
+            raise RuntimeError("out of luck")
+
+    with pytest.raises(RuntimeError, match="out of luck"):
+        work()
     assert list(tmp_path.iterdir()) == []
 
 

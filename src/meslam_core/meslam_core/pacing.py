@@ -33,20 +33,30 @@ class PacedFrames:
         self._clock = clock
         self._sleep = sleep
         self.skipped = 0
+        self._error: Exception | None = None
 
     def __iter__(self) -> Iterator[RgbdFrame]:
-        pending = next(self._frames, None)
-        if pending is None:
-            return
-        first_stamp_ns, started = pending.stamp_ns, self._clock()
+        pending = self._next()
+        first_stamp_ns = 0 if pending is None else pending.stamp_ns
+        started = self._clock()
         while pending is not None:
             wait_s = (pending.stamp_ns - first_stamp_ns) * 1e-9 - (self._clock() - started)
             if wait_s > 0:
                 self._sleep(wait_s)
             now_ns = first_stamp_ns + round((self._clock() - started) * 1e9)
-            following = next(self._frames, None)
+            following = self._next()
             while following is not None and following.stamp_ns <= now_ns:
-                pending, following = following, next(self._frames, None)
+                pending, following = following, self._next()
                 self.skipped += 1
             yield pending
             pending = following
+        if self._error is not None:
+            raise self._error
+
+    def _next(self) -> RgbdFrame | None:
+        """The next frame; an error waits until the frames before it have been yielded."""
+        try:
+            return next(self._frames, None)
+        except Exception as error:
+            self._error = error
+            return None

@@ -2,13 +2,16 @@
 #pragma once
 
 #include <stddef.h>
+#include <stdint.h>
 
 namespace meslam {
 namespace {
 
-// With a null start it only counts: `next` is then the size.
+// From null it only counts: `next` is then the size.
 struct Arena {
-    char* next;
+    uintptr_t next;
+
+    explicit Arena(const void* start) : next(reinterpret_cast<uintptr_t>(start)) {}
 
     template <class T = float>
     T* take(size_t count) {

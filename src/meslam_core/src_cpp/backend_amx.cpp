@@ -1,8 +1,19 @@
 // Bfloat16 by AMX tiles.
 #include "backend.hpp"
 
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#if defined(__x86_64__) && defined(__GNUC__)
+#include <immintrin.h>
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#if defined(__clang__)
+#pragma clang attribute push(                                                     \
+    __attribute__((target("amx-tile,amx-bf16,avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma"))), \
+    apply_to = function)
+#else
 #pragma GCC target("amx-tile,amx-bf16,avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma")
+#endif
 #define MESLAM_USE_TILES
 #define MESLAM_BLOCK 192
 #include "bf16_backend.hpp"
@@ -15,6 +26,10 @@ const Backend* amx_backend() {
 }
 
 }  // namespace meslam
+
+#if defined(__clang__)
+#pragma clang attribute pop
+#endif
 
 #else
 

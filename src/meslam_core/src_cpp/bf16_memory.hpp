@@ -20,11 +20,11 @@ struct PackedWeights {
     Bf16* backward[5];  // right factors of the way back; the last padded to 32 rows
     float* bias[5];
     float* padded_output;  // (32,W): W5 and rows of zeros
-    char* end;
+    uintptr_t end;
 
     PackedWeights(const NetworkShape& shape, void* memory) {
         const size_t w = shape.width, e = shape.embedding;
-        Arena arena{static_cast<char*>(memory)};
+        Arena arena(memory);
         frequency = arena.take(3 * e);
         phase = arena.take(e);
         directions = arena.take(3 * e);
@@ -56,14 +56,14 @@ struct Workspace {
     Bf16* gradient_columns;
     Bf16* slope_rows;
     Bf16* slope_columns;
-    char* end;
+    uintptr_t end;
 
     Workspace(const NetworkShape& shape, void* memory) {
         const size_t w = shape.width, e = shape.embedding;
         hidden_tiles = shape.width / kSide;
         embedding_tiles = shape.embedding / kSide;
         joined_tiles = hidden_tiles + embedding_tiles;
-        Arena arena{static_cast<char*>(memory)};
+        Arena arena(memory);
         points = arena.take(4 * kBlock);
         values = arena.take(4 * kBlock);
         slopes = arena.take(4 * kBlock);
@@ -93,11 +93,11 @@ struct Accumulator {
     float* frequency;  // (4,E): B transposed, then phi
     float* weight[5];  // the last has 16 rows, 4 of them used
     float* bias[5];    // the last: 16 partial sums of the four
-    char* end;
+    uintptr_t end;
 
     Accumulator(const NetworkShape& shape, void* memory) {
         const size_t w = shape.width, e = shape.embedding;
-        Arena arena{static_cast<char*>(memory)};
+        Arena arena(memory);
         frequency = arena.take(4 * e);
         const size_t inputs[5] = {e, w, w + e, w, w};
         const size_t outputs[5] = {w, w, w, w, kSide};
@@ -110,15 +110,15 @@ struct Accumulator {
 };
 
 size_t packed_bytes(const NetworkShape& shape) {
-    return PackedWeights(shape, nullptr).end - static_cast<char*>(nullptr);
+    return PackedWeights(shape, nullptr).end;
 }
 
 size_t workspace_bytes(const NetworkShape& shape) {
-    return Workspace(shape, nullptr).end - static_cast<char*>(nullptr);
+    return Workspace(shape, nullptr).end;
 }
 
 size_t accumulator_floats(const NetworkShape& shape) {
-    return (Accumulator(shape, nullptr).end - static_cast<char*>(nullptr)) / sizeof(float);
+    return Accumulator(shape, nullptr).end / sizeof(float);
 }
 
 void pack(const NetworkShape& shape, const float* parameters, void* memory) {
@@ -178,7 +178,7 @@ void collect(const NetworkShape& shape, float* sums, float* gradients) {
         }
         for (int i = 0; i < 4; ++i) gradients[shape.bias5 + output] += from.bias[4][4 * i + output];
     }
-    memset(sums, 0, from.end - reinterpret_cast<char*>(sums));
+    memset(sums, 0, from.end - reinterpret_cast<uintptr_t>(sums));
 }
 
 }  // namespace

@@ -11,8 +11,10 @@
 #pragma once
 
 // GCC's own intrinsics leave registers undefined on purpose and then warn of them.
+#if !defined(__clang__)
 #pragma GCC diagnostic ignored "-Wuninitialized"
 #pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
+#endif
 #include <immintrin.h>
 
 #include "vector_math.hpp"

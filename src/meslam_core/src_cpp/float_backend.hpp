@@ -26,11 +26,11 @@ struct PackedWeights {
     float* output_back;    // (4,W)
     float* bias[4];
     float* output_bias;  // (lanes), padded
-    char* end;
+    uintptr_t end;
 
     PackedWeights(const NetworkShape& shape, void* memory) {
         const size_t w = shape.width, e = shape.embedding;
-        Arena arena{static_cast<char*>(memory)};
+        Arena arena(memory);
         frequency = arena.take(3 * e);
         phase = arena.take(e);
         back_to_point = arena.take(e * kLanes);
@@ -58,13 +58,13 @@ struct Workspace {
     float* gradient[2];         // (block,W): with respect to a hidden layer's sums
     float* embedding_gradient;  // (block,E)
     float* narrow;              // (block,lanes): products with few columns
-    char* end;
+    uintptr_t end;
 
     Workspace(const NetworkShape& shape, void* memory) {
         hidden_row = shape.width + kRowPadding;
         joined_row = shape.width + shape.embedding + kRowPadding;
         embedding_row = shape.embedding + kRowPadding;
-        Arena arena{static_cast<char*>(memory)};
+        Arena arena(memory);
         points = arena.take(4 * kBlock);
         values = arena.take(4 * kBlock);
         slopes = arena.take(4 * kBlock);
@@ -83,11 +83,11 @@ struct Workspace {
 };
 
 size_t packed_bytes(const NetworkShape& shape) {
-    return PackedWeights(shape, nullptr).end - static_cast<char*>(nullptr);
+    return PackedWeights(shape, nullptr).end;
 }
 
 size_t workspace_bytes(const NetworkShape& shape) {
-    return Workspace(shape, nullptr).end - static_cast<char*>(nullptr);
+    return Workspace(shape, nullptr).end;
 }
 
 // The parameters' own order, but for B, which is transposed: (3,E).

@@ -5,6 +5,7 @@
 #include <stdexcept>
 
 #include "cpu_features.hpp"
+#include "denormals.hpp"
 
 namespace meslam {
 namespace {
@@ -128,6 +129,7 @@ void FusedField::for_each_block(size_t count, size_t block,
         const size_t begin = blocks * thread / threads;
         const size_t end = blocks * (thread + 1) / threads;
         if (begin == end) return;
+        const FlushDenormals flush;
         alignas(64) char saved_state[kSavedStateBytes];
         backend_->enter(saved_state);
         for (size_t i = begin; i < end; ++i) {
@@ -289,6 +291,7 @@ void FusedField::collect_gradients() {
 
 bool FusedField::adam_step(const AdamOptions& options) {
     const Lock lock(mutex_);
+    const FlushDenormals flush;
     collect_gradients();
     const bool usable = backend_->all_finite(gradients_.data(), shape_.parameters);
     if (usable) {

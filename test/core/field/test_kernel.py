@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -448,3 +450,35 @@ def test_arrays_are_checked() -> None:
         field.set_parameters(np.full(field.parameter_count, np.nan, np.float32))
     with pytest.raises(ValueError, match="threads is 0"):
         type(field)(64, 96, "auto", 0)
+
+
+def test_calls_from_several_threads_follow_one_another() -> None:
+    """Tracking reads the field that mapping trains."""
+    parameters = random_parameters(64)
+    field = fused_field("auto", parameters, 64, threads=2)
+    points = random_points(3000)
+    seeds = seeds_for(points)
+    expected = field.forward(points)
+    field.backward(points, seeds)
+    gradients = field.gradients()
+    field.zero_gradients()
+    with ThreadPoolExecutor(3) as pool:
+        reads = [pool.submit(field.forward, points) for _ in range(20)]
+        writes = [pool.submit(field.backward, points, seeds) for _ in range(8)]
+        for read in reads:
+            np.testing.assert_array_equal(read.result(), expected)
+        for write in writes:
+            write.result()
+    np.testing.assert_allclose(field.gradients(), 8 * gradients, rtol=1e-4, atol=1e-3)
+
+
+def test_weights_that_stopped_learning_do_not_slow_the_optimiser() -> None:
+    """Their moments would decay to denormal numbers, which are a hundred times slower."""
+    field = fused_field("auto", random_parameters(64), 64)
+    tiny = np.full(field.parameter_count, 2e-38, np.float32)
+    field.set_optimizer_state(tiny, tiny, 5)
+    for _ in range(100):
+        field.adam_step(1e-3)
+    first, second, _ = field.optimizer_state()
+    assert not first.any()
+    assert not second.any()

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from data.ros_camera import BASE_FRAME, OPTICAL_FRAME, CameraDriver, Messages
@@ -46,8 +48,8 @@ class Camera:
 
     def send(self, number: int, change=lambda messages: None, later_ns: int = 0) -> None:
         frame = frame_at(POSES[number], number)
-        object.__setattr__(frame, "stamp_ns", frame.stamp_ns + NANOSECONDS + later_ns)
-        self._driver.send(frame, change)
+        stamp_ns = frame.stamp_ns + NANOSECONDS + later_ns
+        self._driver.send(replace(frame, stamp_ns=stamp_ns), change)
 
     def track(self, number: int, later_ns: int = 0) -> TrackingStatus:
         before = len(self._client.statuses)

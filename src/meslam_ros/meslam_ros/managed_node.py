@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 import traceback
@@ -85,6 +86,21 @@ class ManagedNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
 
+class RosLogHandler(logging.Handler):
+    """Passes what the core logs on to a node's logger."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        super().__init__(logging.WARNING)
+        self._log = node.get_logger()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # rclpy allows one severity a line.
+        if record.levelno >= logging.ERROR:
+            self._log.error(record.getMessage())
+        else:
+            self._log.warn(record.getMessage())
+
+
 def run(make_node: Callable[[], ManagedNode], executor_threads: int = 1) -> int:
     """Spin a node until a signal or the node itself ends it; returns the exit status."""
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
@@ -109,6 +125,7 @@ def run(make_node: Callable[[], ManagedNode], executor_threads: int = 1) -> int:
         rclpy.try_shutdown()
         return USAGE_ERROR
     node.stop = stop
+    logging.getLogger("meslam_core").addHandler(RosLogHandler(node))
     executor.add_node(node)
     try:
         if node.autostart and not node.start():

@@ -85,7 +85,8 @@ class NodeProcess:
 
     def stop(self, timeout_s: float = STOPPING_S) -> int:
         """Ask it to end, insist after a while; the exit status."""
-        self.signal(signal.SIGINT)
+        # Python ends silently on SIGTERM while it still imports; on SIGINT it shows a traceback.
+        self.signal(signal.SIGTERM)
         status = self.wait(timeout_s)
         if status is None:
             self._process.kill()

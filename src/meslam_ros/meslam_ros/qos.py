@@ -20,9 +20,10 @@ STREAM = QoSProfile(depth=50)
 """Reliable results a frame: poses, status, odometry."""
 
 
-UNKNOWN_NODES = {"_NODE_NAME_UNKNOWN_": "a node not known yet"}
 MODELS_DEPTH = 1000
 """Regions that may arrive at once at a late subscriber."""
+
+UNKNOWN_NODES = {"_NODE_NAME_UNKNOWN_": "a node not known yet"}
 
 
 def latched(depth: int = 1) -> QoSProfile:
@@ -56,7 +57,8 @@ def describe(publishers: list[TopicEndpointInfo]) -> str:
     if not publishers:
         return "no publisher"
     offers = sorted(
-        f"{UNKNOWN_NODES.get(p.node_name, p.node_name)} ({p.qos_profile.reliability.name.lower().replace('_', ' ')})"
+        f"{UNKNOWN_NODES.get(p.node_name, p.node_name)} "
+        f"({p.qos_profile.reliability.name.lower().replace('_', ' ')})"
         for p in publishers
     )
     return f"{len(offers)} publisher{'s' if len(offers) > 1 else ''}: {', '.join(offers)}"

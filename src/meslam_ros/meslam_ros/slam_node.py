@@ -96,7 +96,7 @@ class Supervisor:
     def _end(self) -> None:
         """Ask all nodes to end at once, and insist after a while."""
         for child in self._children:
-            child.process.signal(signal.SIGINT)
+            child.process.signal(signal.SIGTERM)
         deadline = time.monotonic() + STOPPING_S
         for child in self._children:
             child.process.stop(max(deadline - time.monotonic(), 0.1))

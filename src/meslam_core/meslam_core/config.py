@@ -192,6 +192,25 @@ class TrackingConfig:
     color_weight: float = setting(
         0.15, "weight of the colour residual (0 switches it off)", minimum=0.0, maximum=10.0
     )
+    points_per_observation: float = setting(
+        50.0,
+        "points that err together, and count as one observation against odometry",
+        minimum=1.0,
+        maximum=100000.0,
+    )
+    odometry_sigma_m: float = setting(
+        0.004, "error of odometry from frame to frame", unit="m", minimum=1e-5, maximum=1.0
+    )
+    odometry_sigma_deg: float = setting(
+        0.2,
+        "error of odometry's rotation from frame to frame",
+        unit="deg",
+        minimum=1e-4,
+        maximum=45.0,
+    )
+    odometry_drift: float = setting(
+        0.03, "further error of odometry, as a share of the motion", minimum=0.0, maximum=1.0
+    )
     min_inlier_ratio: float = setting(
         0.35, "share of inliers below which a pose is not trusted", minimum=0.0, maximum=1.0
     )
@@ -287,6 +306,13 @@ class MappingConfig:
     )
     color_weight: float = setting(
         1.0, "weight of the rendered-colour loss", minimum=0.0, maximum=100.0
+    )
+    odometry_weight: float = setting(
+        100.0,
+        "weight of odometry between consecutive keyframes (squared error)",
+        unit="1/m^2, 1/rad^2",
+        minimum=0.0,
+        maximum=1e6,
     )
     depth_clip_m: float = setting(
         0.2, "rendered-depth errors count up to this", unit="m", minimum=0.01, maximum=10.0

@@ -17,8 +17,8 @@ from meslam_core.mapping.keyframe_policy import KeyframePolicy
 from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.atlas import RegionAtlas
-from meslam_core.se3 import Pose, exp, inverse, log, orthonormalized
-from meslam_core.tracking.field_tracker import Alignment, FieldTracker
+from meslam_core.se3 import Pose, exp, inverse, log, orthonormalized, rotation_angle
+from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.pixels import choose_pixels, trusted_pixels
 from meslam_core.trajectory import Trajectory
 
@@ -31,6 +31,7 @@ MIN_FRAME_PIXELS = 200
 # Below this share of inliers the other first guesses are tried too.
 CONFIDENT_INLIERS = 0.85
 UNTRUSTED_VARIANCE = 0.25
+FIRST_VARIANCE = 1e-8
 
 
 class TrackingState(enum.IntEnum):
@@ -124,6 +125,8 @@ class Slam:
         self._T_map_first = T_map_camera
         self._frames: list[_TrackedFrame] = []
         self._untrusted = 0
+        self._covariance = np.eye(6) * FIRST_VARIANCE
+        self._keyframe_odometry: OdometryEstimate | None = None
 
     def process(self, frame: RgbdFrame, odometry: OdometryEstimate | None = None) -> FrameResult:
         """Track one frame and train the map with it.
@@ -141,16 +144,19 @@ class Slam:
         if self.atlas is not None and enough:
             alignment, verdict = self._track(frame, pixels, odometry)
         pose = self._accept(frame.stamp_ns, alignment, verdict, odometry)
+        self._covariance = _covariance(alignment if verdict.by_field else None)
+        if odometry is not None and not odometry.valid:
+            self._keyframe_odometry = None
         tracked = time.perf_counter()
         losses, iterations, is_keyframe = StepLosses(), 0, False
         if self.atlas is not None and verdict.trusted:
-            losses, iterations, is_keyframe = self._map(frame, pixels, pose)
+            losses, iterations, is_keyframe = self._map(frame, pixels, pose, odometry)
         self._remember(frame, pose, odometry)
         mapped = time.perf_counter()
         return FrameResult(
             stamp_ns=frame.stamp_ns,
             T_map_camera=pose,
-            covariance=_covariance(alignment if verdict.by_field else None),
+            covariance=self._covariance,
             state=self.state,
             reason=verdict.reason,
             odometry=odometry,
@@ -201,7 +207,7 @@ class Slam:
         """The first frame defines the map frame and trains the first region from nothing."""
         pose = self._T_map_first.copy()
         self.atlas = RegionAtlas(self.config, pose[:3, 3], self.keyframes, self._seed)
-        self._add_keyframe(frame, pixels, pose)
+        self._add_keyframe(frame, pixels, pose, odometry)
         steps = self.config.mapping.first_iterations
         losses = self.optimizer.train(self.atlas.working, steps, refine_poses=False)
         self.atlas.working.version += 1
@@ -210,7 +216,7 @@ class Slam:
         return FrameResult(
             stamp_ns=frame.stamp_ns,
             T_map_camera=pose,
-            covariance=np.eye(6) * 1e-8,
+            covariance=self._covariance,
             state=self.state,
             reason="",
             odometry=odometry,
@@ -235,20 +241,42 @@ class Slam:
         rays = self._sample(frame, pixels, self.config.tracking.points)
         guesses = self._guesses(frame.stamp_ns, odometry)
         costs = [self.tracker.robust_cost(region, rays, guess) for guess in guesses]
+        prior = self._prior(odometry)
         alignments: list[Alignment] = []
         for index in np.argsort(costs):
-            alignments.append(self.tracker.align(region, rays, guesses[index]))
+            alignments.append(self.tracker.align(region, rays, guesses[index], prior))
             if alignments[-1].inlier_ratio > CONFIDENT_INLIERS:
                 break
         best = max(alignments, key=lambda alignment: alignment.inlier_ratio)
         return best, self._judge(best, odometry)
 
+    def _motion(self, odometry: OdometryEstimate | None) -> Pose | None:
+        """Odometry's motion (4, 4) since the last frame; None where it is not valid."""
+        last = self._frames[-1].odometry
+        if odometry is None or last is None or not odometry.valid:
+            return None
+        return inverse(last.T_odom_camera) @ odometry.T_odom_camera
+
+    def _prior(self, odometry: OdometryEstimate | None) -> PosePrior | None:
+        """The last pose moved by odometry, as certain as both are."""
+        motion = self._motion(odometry)
+        if motion is None:
+            return None
+        limits = self.config.tracking
+        distance = float(np.linalg.norm(motion[:3, 3]))
+        sigma_m = limits.odometry_sigma_m + limits.odometry_drift * distance
+        sigma_rad = np.deg2rad(limits.odometry_sigma_deg)
+        sigma_rad += limits.odometry_drift * rotation_angle(motion)
+        variances = np.repeat([sigma_m**2, sigma_rad**2], 3)
+        covariance = self._covariance + np.diag(variances)
+        mean = orthonormalized(self._latest_pose() @ motion)
+        return PosePrior(mean, np.linalg.inv(covariance))
+
     def _guesses(self, stamp_ns: int, odometry: OdometryEstimate | None) -> list[Pose]:
         """First guesses of a pose: odometry since the last frame, constant velocity, standstill."""
         guesses = []
-        last = self._frames[-1]
-        if odometry is not None and odometry.valid and last.odometry is not None:
-            motion = inverse(last.odometry.T_odom_camera) @ odometry.T_odom_camera
+        motion = self._motion(odometry)
+        if motion is not None:
             guesses.append(self._latest_pose() @ motion)
         guesses.append(self._extrapolated(stamp_ns))
         guesses.append(self._latest_pose())
@@ -308,7 +336,11 @@ class Slam:
         return self._guesses(stamp_ns, odometry)[0]
 
     def _map(
-        self, frame: RgbdFrame, pixels: NDArray[np.bool_], pose: Pose
+        self,
+        frame: RgbdFrame,
+        pixels: NDArray[np.bool_],
+        pose: Pose,
+        odometry: OdometryEstimate | None,
     ) -> tuple[StepLosses, int, bool]:
         """Update the regions for the pose, add a keyframe where due, and train."""
         assert self.atlas is not None
@@ -323,7 +355,7 @@ class Slam:
             self._sample(frame, pixels, self.policy.PIXELS),
         )
         if is_keyframe:
-            self._add_keyframe(frame, pixels, pose)
+            self._add_keyframe(frame, pixels, pose, odometry)
         current = self._sample(frame, pixels, CURRENT_FRAME_RAYS)
         mapping = self.config.mapping
         steps = mapping.keyframe_iterations if is_keyframe else mapping.iterations
@@ -334,10 +366,21 @@ class Slam:
             neighbor.version += 1
         return losses, steps, is_keyframe
 
-    def _add_keyframe(self, frame: RgbdFrame, pixels: NDArray[np.bool_], pose: Pose) -> None:
+    def _add_keyframe(
+        self,
+        frame: RgbdFrame,
+        pixels: NDArray[np.bool_],
+        pose: Pose,
+        odometry: OdometryEstimate | None,
+    ) -> None:
+        """Make the frame a keyframe, linked to the last one where odometry never failed since."""
         assert self.atlas is not None
         rays = self._sample(frame, pixels, self.config.keyframes.rays)
-        self.atlas.add_keyframe(self.keyframes.add(frame.stamp_ns, pose, rays))
+        link = None
+        if odometry is not None and self._keyframe_odometry is not None:
+            link = inverse(self._keyframe_odometry.T_odom_camera) @ odometry.T_odom_camera
+        self._keyframe_odometry = odometry if odometry is not None and odometry.valid else None
+        self.atlas.add_keyframe(self.keyframes.add(frame.stamp_ns, pose, rays, link))
 
     def _remember(self, frame: RgbdFrame, pose: Pose, odometry: OdometryEstimate | None) -> None:
         if not len(self.keyframes):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from meslam_core.config import MappingConfig
-from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON, FieldModel
+from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON
 from meslam_core.field.rendering import render
 from meslam_core.field.sampling import sample_distances
 from meslam_core.mapping.keyframes import KeyframeStore, Rays
@@ -16,6 +16,8 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, torch_exp
 
 LOSS_MEMORY = 0.8
+# Odometry that disagrees by more than this [m, rad] is taken for a failure and lets go.
+LINK_OUTLIER = 0.03
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,8 @@ class JointOptimizer:
         if not bool(torch.isfinite(gradient).all()):
             return
         self._grow_moments()
+        if self.config.odometry_weight > 0.0:
+            gradient += self.config.odometry_weight * self._link_gradient()
         gradient[0] = 0.0
         beta1, beta2 = ADAM_BETAS
         self._pose_steps += 1
@@ -186,6 +190,30 @@ class JointOptimizer:
         rotations = step[:, :3, :3] @ self.keyframes.rotations
         u, _, vt = torch.linalg.svd(rotations)
         self.keyframes.rotations.copy_(u @ vt)
+
+    def _link_gradient(self) -> torch.Tensor:
+        """Gradient (K, 6) of half the squared deviations from odometry between keyframes."""
+        rotations, translations = self.keyframes.rotations, self.keyframes.translations
+        link_rotations, link_translations, weights = (part[1:] for part in self.keyframes.links)
+        arms = (rotations[:-1] @ link_translations[..., None])[..., 0]
+        moved = translations[1:] - translations[:-1] - arms
+        turned = rotations[1:] @ (rotations[:-1] @ link_rotations).transpose(1, 2)
+        turned = 0.5 * torch.stack(
+            [
+                turned[:, 2, 1] - turned[:, 1, 2],
+                turned[:, 0, 2] - turned[:, 2, 0],
+                turned[:, 1, 0] - turned[:, 0, 1],
+            ],
+            dim=1,
+        )
+        moved = moved * (weights * _outlier_weight(moved))[:, None]
+        turned = turned * (weights * _outlier_weight(turned))[:, None]
+        gradient = torch.zeros(len(self.keyframes), 6, device=self.device)
+        gradient[1:, :3] += moved
+        gradient[:-1, :3] -= moved
+        gradient[1:, 3:] += turned
+        gradient[:-1, 3:] -= turned + torch.linalg.cross(arms, moved)
+        return gradient
 
     def _grow_moments(self) -> None:
         missing = len(self.keyframes) - len(self._first_moment)
@@ -205,3 +233,8 @@ class JointOptimizer:
         self.keyframes.losses[seen] = (
             LOSS_MEMORY * self.keyframes.losses[seen] + (1 - LOSS_MEMORY) * mean
         )
+
+
+def _outlier_weight(error: torch.Tensor) -> torch.Tensor:
+    """Geman-McClure weights (K,) of errors (K, 3)."""
+    return (1.0 + (error * error).sum(dim=1) / LINK_OUTLIER**2) ** -2

@@ -68,6 +68,9 @@ class KeyframeStore:
         self._rotations = torch.empty(0, 3, 3, device=device)
         self._translations = torch.empty(0, 3, device=device)
         self._losses = torch.empty(0, device=device)
+        self._link_rotations = torch.empty(0, 3, 3, device=device)
+        self._link_translations = torch.empty(0, 3, device=device)
+        self._link_weights = torch.empty(0, device=device)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -84,8 +87,27 @@ class KeyframeStore:
     def losses(self) -> torch.Tensor:
         return self._losses[: len(self)]
 
-    def add(self, stamp_ns: int, T_map_camera: Pose, rays: Rays) -> int:
-        """Append a keyframe and return its index."""
+    @property
+    def links(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Odometry from each keyframe's predecessor: (K, 3, 3), (K, 3) [m], weights (K,)."""
+        count = len(self)
+        return (
+            self._link_rotations[:count],
+            self._link_translations[:count],
+            self._link_weights[:count],
+        )
+
+    def add(
+        self, stamp_ns: int, T_map_camera: Pose, rays: Rays, T_previous_this: Pose | None = None
+    ) -> int:
+        """Append a keyframe and return its index.
+
+        Args:
+            stamp_ns: of its image [ns].
+            T_map_camera: (4, 4).
+            rays: at least one, camera frame.
+            T_previous_this: (4, 4) odometry from the previous keyframe, where it is valid.
+        """
         index = len(self)
         if index == self._capacity:
             self._grow()
@@ -96,6 +118,10 @@ class KeyframeStore:
         self.stamps_ns.append(stamp_ns)
         self.set_pose(index, T_map_camera)
         self._losses[index] = self.losses[:index].max() if index else 1.0
+        if T_previous_this is not None:
+            link = torch.from_numpy(T_previous_this).float().to(self.device)
+            self._link_rotations[index], self._link_translations[index] = link[:3, :3], link[:3, 3]
+            self._link_weights[index] = 1.0
         return index
 
     def _grow(self) -> None:
@@ -107,6 +133,9 @@ class KeyframeStore:
             "_rotations",
             "_translations",
             "_losses",
+            "_link_rotations",
+            "_link_translations",
+            "_link_weights",
         ):
             old = getattr(self, name)
             new = old.new_zeros((self._capacity, *old.shape[1:]))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from meslam_core.config import TrackingConfig
 from meslam_core.field.model import LUMA
@@ -48,6 +49,25 @@ class Alignment:
 
 
 @dataclass(frozen=True)
+class PosePrior:
+    """What is believed of a pose before the field is asked: odometry from the last pose on.
+
+    Attributes:
+        T_map_camera: (4, 4) mean.
+        information: (6, 6) of (translation [m], rotation [rad]) about the camera centre, map axes.
+    """
+
+    T_map_camera: Pose
+    information: NDArray[np.float64]
+
+    def deviation(self, T_map_camera: Pose) -> NDArray[np.float64]:
+        """How a pose differs from the mean (6,): (translation [m], rotation [rad]), map axes."""
+        turned = T_map_camera[:3, :3] @ self.T_map_camera[:3, :3].T
+        rotation = Rotation.from_matrix(turned).as_rotvec()
+        return np.concatenate([T_map_camera[:3, 3] - self.T_map_camera[:3, 3], rotation])
+
+
+@dataclass(frozen=True)
 class _Residuals:
     """Distances [m], their pose derivatives, and the same for colour; one row a point."""
 
@@ -65,13 +85,16 @@ class FieldTracker:
     def __init__(self, config: TrackingConfig) -> None:
         self.config = config
 
-    def align(self, region: Region, rays: Rays, T_map_camera: Pose) -> Alignment:
+    def align(
+        self, region: Region, rays: Rays, T_map_camera: Pose, prior: PosePrior | None = None
+    ) -> Alignment:
         """Refine a pose until the frame's points lie on the mapped surface.
 
         Args:
             region: the working region.
             rays: of the frame, camera frame.
             T_map_camera: (4, 4) first guess.
+            prior: keeps the pose where geometry leaves it free, and smooth.
         """
         pose = T_map_camera.copy()
         converged = False
@@ -81,7 +104,7 @@ class FieldTracker:
             residuals = self._residuals(region, rays, pose)
             if np.count_nonzero(residuals.usable) < MIN_POINTS:
                 break
-            information, step = self._solve(rays, residuals, self._huber(iteration))
+            information, step = self._solve(rays, residuals, self._huber(iteration), pose, prior)
             if not np.isfinite(step).all():
                 break
             motion = exp(np.concatenate([np.zeros(3), step[3:]]))
@@ -147,7 +170,12 @@ class FieldTracker:
         )
 
     def _solve(
-        self, rays: Rays, residuals: _Residuals, huber_m: float
+        self,
+        rays: Rays,
+        residuals: _Residuals,
+        huber_m: float,
+        pose: Pose,
+        prior: PosePrior | None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Information (6, 6) and step (6,) of one iteratively reweighted step."""
         depth = rays.distances_m.numpy()
@@ -162,9 +190,15 @@ class FieldTracker:
             jacobian = residuals.luma_jacobian
             information = information + (jacobian * weight[:, None]).T @ jacobian
             gradient = gradient + jacobian.T @ (weight * residuals.luma)
+        # Neighbouring points err alike, in the depth image as in the map.
+        scale = 1.0 / (self.config.huber_narrow_m**2 * self.config.points_per_observation)
+        information, gradient = information * scale, gradient * scale
+        if prior is not None:
+            information = information + prior.information
+            gradient = gradient + prior.information @ prior.deviation(pose)
         damping = 1e-6 * np.trace(information) / 6.0 + 1e-9
         step = -np.linalg.solve(information + damping * np.eye(6), gradient)
-        return information / huber_m**2, step
+        return information, step
 
 
 def _huber_weight(residual: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import yaml
 
@@ -35,7 +35,7 @@ def setting(
         "maximum": maximum,
         "choices": choices,
     }
-    return dataclasses.field(default=default, metadata=metadata)  # type: ignore[return-value]
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Setting:
         Raises:
             ConfigError: when the type is wrong or the value out of range.
         """
-        kind = type(self.default)
+        kind: Any = type(self.default)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if type(value) is not kind:
@@ -71,13 +71,16 @@ class Setting:
             )
         if self.choices and value not in self.choices:
             raise ConfigError(f"{self.path} = {value!r}; choose one of {', '.join(self.choices)}")
-        below = self.minimum is not None and not value >= self.minimum
-        above = self.maximum is not None and not value <= self.maximum
-        if below or above:
+        if not self._in_range(value):
             raise ConfigError(
                 f"{self.path} = {value} is outside [{self.minimum}, {self.maximum}] {self.unit}"
             )
-        return value
+        return cast("int | float | bool | str", value)
+
+    def _in_range(self, value: Any) -> bool:
+        """Whether a value keeps the limits; not-a-number keeps none."""
+        low = self.minimum is None or value >= self.minimum
+        return low and (self.maximum is None or value <= self.maximum)
 
 
 @dataclass(frozen=True)
@@ -308,7 +311,7 @@ class MappingConfig:
         1.0, "weight of the rendered-colour loss", minimum=0.0, maximum=100.0
     )
     odometry_weight: float = setting(
-        100.0,
+        30.0,
         "weight of odometry between consecutive keyframes (squared error)",
         unit="1/m^2, 1/rad^2",
         minimum=0.0,
@@ -459,9 +462,8 @@ def settings() -> Iterator[Setting]:
     """Every setting in the order of its declaration."""
     for section in dataclasses.fields(MeslamConfig):
         for entry in dataclasses.fields(type(getattr(MeslamConfig(), section.name))):
-            yield Setting(
-                section=section.name, name=entry.name, default=entry.default, **entry.metadata
-            )
+            default: Any = entry.default
+            yield Setting(section.name, entry.name, default, **entry.metadata)
 
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {

@@ -22,6 +22,9 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, exp, inverse, orthonormalized
 
 SATURATION = 0.95
+# Limits of the believed noise of a point's distance to the surface [m].
+MIN_SPREAD_M = 0.003
+MAX_SPREAD_M = 0.05
 MIN_POINTS = 30
 
 
@@ -116,8 +119,8 @@ class FieldTracker:
         pose = orthonormalized(pose)
         residuals = self._residuals(region, rays, pose)
         distance = np.abs(residuals.distance[residuals.usable])
-        inliers = np.count_nonzero(distance < self.config.inlier_distance_m)
-        observed = np.count_nonzero(residuals.observed)
+        inliers = int(np.count_nonzero(distance < self.config.inlier_distance_m))
+        observed = int(np.count_nonzero(residuals.observed))
         return Alignment(
             T_map_camera=pose,
             information=information,
@@ -145,12 +148,12 @@ class FieldTracker:
         arms = (rays.directions.numpy() * rays.distances_m.numpy()[:, None]) @ pose[:3, :3].T
         T_region_map = inverse(region.T_map_region)
         points = (arms + pose[:3, 3]) @ T_region_map[:3, :3].T + T_region_map[:3, 3]
-        values, gradient, luma_gradient = region.field.probe(
+        values, field_gradient, field_luma_gradient = region.field.probe(
             np.ascontiguousarray(points / region.half_side_m, dtype=np.float32)
         )
         to_map = T_region_map[:3, :3] / region.half_side_m
-        gradient = gradient.astype(np.float64) @ to_map
-        luma_gradient = luma_gradient.astype(np.float64) @ to_map
+        gradient = field_gradient.astype(np.float64) @ to_map
+        luma_gradient = field_luma_gradient.astype(np.float64) @ to_map
         slope = np.linalg.norm(gradient, axis=1)
         # What the network says of space that nobody saw means nothing, and neither does its
         # gradient where it is saturated, far from any surface.
@@ -191,7 +194,8 @@ class FieldTracker:
             information = information + (jacobian * weight[:, None]).T @ jacobian
             gradient = gradient + jacobian.T @ (weight * residuals.luma)
         # Neighbouring points err alike, in the depth image as in the map.
-        scale = 1.0 / (self.config.huber_narrow_m**2 * self.config.points_per_observation)
+        sigma = _spread(residuals.distance[residuals.usable])
+        scale = 1.0 / (sigma**2 * self.config.points_per_observation)
         information, gradient = information * scale, gradient * scale
         if prior is not None:
             information = information + prior.information
@@ -203,3 +207,8 @@ class FieldTracker:
 
 def _huber_weight(residual: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
     return np.minimum(1.0, threshold / np.maximum(np.abs(residual), 1e-12))
+
+
+def _spread(distance: NDArray[np.float64]) -> float:
+    """Standard deviation [m] of residuals, from their median so that outliers do not count."""
+    return float(np.clip(1.4826 * np.median(np.abs(distance)), MIN_SPREAD_M, MAX_SPREAD_M))

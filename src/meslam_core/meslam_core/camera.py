@@ -61,7 +61,7 @@ class PinholeCamera:
         )
 
     def ray_directions(
-        self, u: NDArray[np.floating], v: NDArray[np.floating]
+        self, u: NDArray[np.number], v: NDArray[np.number]
     ) -> NDArray[np.float32]:
         """Directions with z = 1 through pixels (u, v), shape (..., 3), camera frame."""
         x = (np.asarray(u, np.float64) - self.cx) / self.fx
@@ -82,7 +82,9 @@ class PinholeCamera:
             )
         return self.pixel_directions() * depth_m[..., None].astype(np.float32)
 
-    def project(self, points: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray]:
+    def project(
+        self, points: NDArray[np.floating]
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
         """Project points (N, 3) [m, camera frame] to (u, v, z); u and v are NaN where z <= 0."""
         z = points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):

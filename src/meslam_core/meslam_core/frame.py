@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ class RgbdFrame:
         return self.stamp_ns * 1e-9
 
 
-def depth_to_metres(raw: NDArray, scale_m: float = 0.001) -> NDArray[np.float32]:
+def depth_to_metres(raw: NDArray[Any], scale_m: float = 0.001) -> NDArray[np.float32]:
     """Depth image in metres with every unusable value set to 0.
 
     Args:

@@ -103,7 +103,8 @@ def observed_volume_m3(slam: Slam) -> float:
 def _observed_positions(mask: ObservedMask) -> NDArray[np.float64]:
     """Centres (N, 3) of the observed voxels about the region's centre [m]."""
     voxels = np.argwhere(mask.flags & OBSERVED)
-    return (voxels + 0.5) * mask.voxel_m - mask.half_extent_m
+    positions: NDArray[np.float64] = (voxels + 0.5) * mask.voxel_m - mask.half_extent_m
+    return positions
 
 
 def run_environment() -> dict[str, Any]:

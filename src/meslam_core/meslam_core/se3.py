@@ -23,11 +23,12 @@ def _left_jacobian(w: NDArray[np.floating]) -> NDArray[np.float64]:
     """Left Jacobian of SO(3) (Barfoot, Eq. 7.77)."""
     angle = float(np.linalg.norm(w))
     skew = hat(w)
-    if angle < 1e-5:
-        return np.eye(3) + 0.5 * skew + skew @ skew / 6.0
-    a = (1.0 - np.cos(angle)) / angle**2
-    b = (angle - np.sin(angle)) / angle**3
-    return np.eye(3) + a * skew + b * skew @ skew
+    a, b = 0.5, 1.0 / 6.0
+    if angle >= 1e-5:
+        a = (1.0 - np.cos(angle)) / angle**2
+        b = (angle - np.sin(angle)) / angle**3
+    jacobian: NDArray[np.float64] = np.eye(3) + a * skew + b * skew @ skew
+    return jacobian
 
 
 def exp(twist: NDArray[np.floating]) -> Pose:

@@ -270,7 +270,7 @@ class Slam:
         variances = np.repeat([sigma_m**2, sigma_rad**2], 3)
         covariance = self._covariance + np.diag(variances)
         mean = orthonormalized(self._latest_pose() @ motion)
-        return PosePrior(mean, np.linalg.inv(covariance))
+        return PosePrior(mean, inverted(covariance))
 
     def _guesses(self, stamp_ns: int, odometry: OdometryEstimate | None) -> list[Pose]:
         """First guesses of a pose: odometry since the last frame, constant velocity, standstill."""
@@ -396,4 +396,9 @@ def _covariance(alignment: Alignment | None) -> NDArray[np.float64]:
     """Covariance (6, 6) of a pose; `None` where the field did not confirm it."""
     if alignment is None:
         return np.eye(6) * UNTRUSTED_VARIANCE
-    return np.linalg.inv(alignment.information + np.eye(6))
+    return inverted(alignment.information + np.eye(6))
+
+
+def inverted(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of a covariance or information matrix (6, 6)."""
+    return np.asarray(np.linalg.inv(matrix), np.float64)

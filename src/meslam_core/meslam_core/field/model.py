@@ -70,7 +70,8 @@ class TorchField:
         )
 
     def evaluate(self, points: torch.Tensor) -> torch.Tensor:
-        return self.network(points)
+        values: torch.Tensor = self.network(points)
+        return values
 
     def step(self, learning_rate: float) -> bool:
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
@@ -82,7 +83,7 @@ class TorchField:
         return finite
 
     def predict(self, points: Floats) -> Floats:
-        batches = torch.from_numpy(points).split(1 << 16)
+        batches = torch.split(torch.from_numpy(points), 1 << 16)
         with torch.no_grad():
             return np.concatenate(
                 [self.network(batch.to(self.device)).cpu().numpy() for batch in batches]

@@ -90,7 +90,9 @@ def parameter_count(width: int, embedding: int) -> int:
     return sum(int(np.prod(shape)) for shape in parameter_shapes(width, embedding).values())
 
 
-def shifted(vector: NDArray[np.float32], embedding: int, offset: NDArray[np.floating]) -> NDArray:
+def shifted(
+    vector: NDArray[np.float32], embedding: int, offset: NDArray[np.floating]
+) -> NDArray[np.float32]:
     """The same field about an origin moved by `offset` (3,), region coordinates.
 
     The result at x equals the given field at x + offset, exactly (see `GaussianEncoding`).

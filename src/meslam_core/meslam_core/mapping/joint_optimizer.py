@@ -109,7 +109,7 @@ class JointOptimizer:
                 rays, origins, directions, current, T_map_current
             )
         losses = self._losses(region, rays, origins, directions)
-        losses.total.mean().backward()
+        torch.autograd.backward(losses.total.mean())
         if region.field.step(self.config.learning_rate) and refine_poses:
             assert twists.grad is not None
             self._move_poses(twists.grad)

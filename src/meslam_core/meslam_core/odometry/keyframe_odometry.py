@@ -150,4 +150,5 @@ def _covariance(registration: Registration, valid: bool) -> NDArray[np.float64]:
     correspondences = max(np.trace(information[:3, :3]) / 3.0, 1.0)
     information = information * (INDEPENDENT_CORRESPONDENCES / correspondences)
     variance = np.clip(registration.residual_m, 1e-3, 1.0) ** 2
-    return np.linalg.inv(information + 1e-3 * np.eye(6)) * variance
+    covariance: NDArray[np.float64] = np.linalg.inv(information + 1e-3 * np.eye(6)) * variance
+    return covariance

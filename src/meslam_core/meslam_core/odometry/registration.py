@@ -74,7 +74,8 @@ def _reduced(
     """Colour, depth and camera at the odometry's resolution, a power of two smaller."""
     color, depth, camera = frame.color, frame.depth_m, frame.camera
     while camera.width > odometry.image_width and min(camera.width, camera.height) % 2 == 0:
-        color = cv2.resize(color, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        half = (camera.width // 2, camera.height // 2)
+        color = np.asarray(cv2.resize(color, half, interpolation=cv2.INTER_AREA), np.uint8)
         # Averaging depth would invent points between foreground and background.
         depth = depth[::2, ::2]
         camera = PinholeCamera(

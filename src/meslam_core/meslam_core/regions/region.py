@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ class Region:
     side_m: float
     field: FieldModel
     mask: ObservedMask
-    keyframes: list[int] = field(default_factory=list)
+    keyframes: list[int] = dataclasses.field(default_factory=list)
     version: int = 0
 
     @property

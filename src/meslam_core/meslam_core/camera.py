@@ -60,9 +60,7 @@ class PinholeCamera:
             cy=(self.cy + 0.5) * factor - 0.5,
         )
 
-    def ray_directions(
-        self, u: NDArray[np.number], v: NDArray[np.number]
-    ) -> NDArray[np.float32]:
+    def ray_directions(self, u: NDArray[np.number], v: NDArray[np.number]) -> NDArray[np.float32]:
         """Directions with z = 1 through pixels (u, v), shape (..., 3), camera frame."""
         x = (np.asarray(u, np.float64) - self.cx) / self.fx
         y = (np.asarray(v, np.float64) - self.cy) / self.fy
@@ -89,9 +87,11 @@ class PinholeCamera:
         z = points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = np.where(z > 0, 1.0 / z, np.nan)
-        return points[:, 0] * inverse * self.fx + self.cx, (
-            points[:, 1] * inverse * self.fy + self.cy
-        ), z
+        return (
+            points[:, 0] * inverse * self.fx + self.cx,
+            (points[:, 1] * inverse * self.fy + self.cy),
+            z,
+        )
 
     def to_dict(self) -> dict[str, float]:
         """Plain numbers, as in a `camera.json`."""

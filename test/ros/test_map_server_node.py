@@ -11,9 +11,11 @@ from data.analytic_scene import GRID, SphereInRoom, learnt_field, stored
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from meslam_core.map.stored_region import StoredRegion
+from meslam_core.se3 import exp
 from meslam_interfaces.msg import RegionIndex, RegionModel
 from meslam_interfaces.srv import (
     ExportMap,
@@ -29,6 +31,7 @@ from meslam_ros.client import MeslamClient
 from meslam_ros.map_server_node import MapServerNode
 from meslam_ros.qos import STREAM, latched
 from meslam_ros.region_messages import region_model
+from meslam_ros.transforms import StaticBroadcaster
 
 WAIT_S = 20.0
 SCENE = SphereInRoom()
@@ -180,6 +183,23 @@ def test_space_nobody_saw_is_unknown(server, client, regions) -> None:
     fill(client, regions[0])
     answer = query(client, [[0, 0, 0], [9, 9, 9], [1.2, 0, 0]])
     assert list(answer.occupancy) == [-1, -1, 0]
+
+
+def test_points_may_be_given_in_another_frame(server, client, regions) -> None:
+    fill(client, regions[0])
+    T_map_gripper = exp(np.array([0.3, -0.2, 0.1, 0.4, 0.2, -1.0]))
+    kept = StaticBroadcaster(client.node, T_map_gripper, "map", "gripper")
+    points = np.random.default_rng(2).uniform(-1.2, 1.2, (200, 3))
+    in_map = query(client, points)
+    moved = (points - T_map_gripper[:3, 3]) @ T_map_gripper[:3, :3]
+
+    def same() -> bool:
+        answer = query(client, moved, header=Header(frame_id="gripper"))
+        agree = np.array(answer.occupancy) == np.array(in_map.occupancy)
+        # The way there and back costs a rounding error at the surface.
+        return answer.result == Code.SUCCESS and agree.mean() > 0.98
+
+    assert client.spin_until(same, WAIT_S), kept
 
 
 def test_grid_shows_the_ball_and_the_room(server, client, regions) -> None:

@@ -134,6 +134,16 @@ def from_pose(message: Pose) -> se3.Pose:
     return _checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
 
+def from_transform(message: Transform) -> se3.Pose:
+    """The (4, 4) pose [m] of a transform.
+
+    Raises:
+        FrameError: when a number is not finite.
+    """
+    p, q = message.translation, message.rotation
+    return _checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
 def to_transform(T: se3.Pose, stamp: Time, parent: str, child: str) -> TransformStamped:
     """The transform message of T_parent_child (4, 4) [m]."""
     position = _point(T)
@@ -150,7 +160,7 @@ def to_transform(T: se3.Pose, stamp: Time, parent: str, child: str) -> Transform
 
 def _checked_pose(position: tuple[float, ...], quaternion: tuple[float, ...]) -> se3.Pose:
     if not np.isfinite([*position, *quaternion]).all():
-        raise FrameError(f"a pose with position {position} and quaternion {quaternion}")
+        raise FrameError(f"a pose has position {position} and quaternion {quaternion}")
     if not any(quaternion):
         quaternion = (0.0, 0.0, 0.0, 1.0)
     return se3.from_quaternion(np.array(position), np.array(quaternion))

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
-from meslam_core.errors import FrameError, MapError
+from meslam_core.errors import MapError
 from meslam_core.se3 import Pose
 from meslam_interfaces.msg import RegionModel
 from meslam_interfaces.srv import (
@@ -32,6 +32,7 @@ from meslam_ros.parameters import declare_config, declare_settings
 from meslam_ros.qos import MODELS_DEPTH, latched
 from meslam_ros.region_messages import model_name
 from meslam_ros.rgbd_input import STEADY
+from meslam_ros.transform_buffer import TransformBuffer
 
 EXECUTOR_THREADS = 4
 
@@ -49,6 +50,7 @@ class MapServerNode(ManagedNode):
     def configure(self) -> None:
         self._models = MapModels(self._config, self._frames.map_frame)
         self._refused: Counter[str] = Counter()
+        self._transforms = TransformBuffer(self)
         requests = MapRequests(
             self._models,
             self._settings,
@@ -90,6 +92,7 @@ class MapServerNode(ManagedNode):
 
     def cleanup(self) -> None:
         self._diagnostics.close()
+        self._transforms.close()
         for service in self._map_services:
             self.destroy_service(service)
 
@@ -101,11 +104,8 @@ class MapServerNode(ManagedNode):
             self.get_logger().error(f"region model refused: {error}")
 
     def _lookup(self, frame: str, stamp_ns: int) -> Pose:
-        """T_map_frame (4, 4) [m]."""
-        raise FrameError(
-            f"points in the frame {frame!r} are not known here; give them in "
-            f"{self._frames.map_frame!r}"
-        )
+        """T_map_frame (4, 4) [m] at a time [ns]."""
+        return self._transforms.lookup(self._frames.map_frame, frame, stamp_ns)
 
     def _diagnose(self) -> None:
         entries, refused = self._models.entries(), counts(self._refused)

@@ -45,8 +45,8 @@ struct Backend {
                     int count, Keep keep, float* values);
 
     // Goes back through the block of the last forward call. grad_values (count,4) is the gradient
-    // with respect to `values`. Adds to `accumulator` unless it is null (forward must then have kept
-    // everything); writes grad_points (count,3) unless it is null.
+    // with respect to `values`. Adds to `accumulator` unless it is null: forward must then have
+    // kept everything. Writes grad_points (count,3) unless it is null.
     void (*backward)(const NetworkShape&, const void* packed, void* workspace,
                      const float* grad_values, int count, float* grad_points, float* accumulator);
 

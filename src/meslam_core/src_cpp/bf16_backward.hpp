@@ -96,7 +96,8 @@ void descend(const Workspace& work, int layer, const Term& term, int groups, Bf1
                 float* const to = bias + feature_group * kGroup;
                 _mm512_store_ps(to, bias_low + _mm512_load_ps(to));
                 _mm512_store_ps(to + kSide, bias_high + _mm512_load_ps(to + kSide));
-                Bf16* const tile = columns + (2 * feature_group * kBlockGroups + sample_group) * kTile;
+                Bf16* const tile =
+                    columns + (2 * feature_group * kBlockGroups + sample_group) * kTile;
                 transpose_tile(pairs, tile);
                 transpose_tile(pairs + kTile, tile + kBlockGroups * kTile);
             }
@@ -198,7 +199,8 @@ void backward_block(const NetworkShape& shape, const PackedWeights& packed, cons
         groups, tiles / 2, both, nullptr,
         [=](int sample_group, int feature_group, const float* from) {
             for (int i = 0; i < 2; ++i) {
-                const ptrdiff_t start = ((2 * sample_group + i) * tiles + 2 * feature_group) * kSums;
+                const ptrdiff_t start =
+                    ((2 * sample_group + i) * tiles + 2 * feature_group) * kSums;
                 for (int j = 0; j < 2 * kSums; j += kLanes) {
                     store(gradient + start + j,
                           load(from + i * 2 * kSums + j) * load(cosine + start + j));

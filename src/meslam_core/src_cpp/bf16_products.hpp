@@ -153,8 +153,9 @@ MESLAM_INLINE void multiply_group(const Term* terms, const float* bias, float* s
 // A group's products are started before the previous group is finished, so that the tile unit and
 // the vector units work at the same time.
 template <Start kStart, int kTerms = 1, class Finish>
-MESLAM_INLINE void multiply_and_finish(int row_groups, int column_groups, const Term (&terms)[kTerms],
-                                       const float* bias, Finish finish) {
+MESLAM_INLINE void multiply_and_finish(int row_groups, int column_groups,
+                                       const Term (&terms)[kTerms], const float* bias,
+                                       Finish finish) {
     alignas(64) float sums[2][4 * kSums];
     int last_row = 0, last_column = 0, parity = 0;
     bool pending = false;

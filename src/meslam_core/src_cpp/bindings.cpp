@@ -127,7 +127,8 @@ PYBIND11_MODULE(_kernel, module) {
     module.def("available_isas", available_isas, "Instruction sets usable here, the best first.");
     using Free = py::call_guard<py::gil_scoped_release>;
     py::class_<FusedField> field(module, "FusedField");
-    field        .def(py::init<int, int, const std::string&, int>(), py::arg("width"), py::arg("embedding"),
+    field
+        .def(py::init<int, int, const std::string&, int>(), py::arg("width"), py::arg("embedding"),
              py::arg("isa") = "auto", py::arg("threads") = 1)
         .def_property_readonly("width", [](const FusedField& f) { return f.shape().width; })
         .def_property_readonly("embedding", [](const FusedField& f) { return f.shape().embedding; })
@@ -149,7 +150,8 @@ PYBIND11_MODULE(_kernel, module) {
         .def("backward", backward, py::arg("points"), py::arg("grad_values"),
              py::arg("want_points") = true)
         .def("adam_step", adam_step, py::arg("learning_rate"), py::arg("beta1") = 0.9f,
-             py::arg("beta2") = 0.99f, py::arg("epsilon") = 1e-8f, py::arg("encoding_scale") = 1.0f);
+             py::arg("beta2") = 0.99f, py::arg("epsilon") = 1e-8f,
+             py::arg("encoding_scale") = 1.0f);
     bind_rays(module, field);
 }
 

@@ -133,8 +133,9 @@ const Backend* find_backend(const std::string& name) {
     for (const Backend* backend : available) {
         if (name == backend->name) return backend;
     }
-    throw std::invalid_argument("instruction set '" + name + "' is not available here; there are: " +
-                                join_names(available) + " (and auto, the first of them)");
+    throw std::invalid_argument("instruction set '" + name +
+                                "' is not available here; there are: " + join_names(available) +
+                                " (and auto, the first of them)");
 }
 
 }  // namespace meslam

@@ -11,7 +11,8 @@
 namespace meslam {
 namespace {
 
-constexpr int kBlock = 64;
+// A multiple of every tile's rows.
+constexpr int kBlock = 120;
 constexpr float kInversePi = 0.318309886f;
 // Rows of a power-of-two length would fall on the same few cache sets.
 constexpr int kRowPadding = 16;

@@ -146,7 +146,7 @@ void FusedField::for_each_block(size_t count, size_t block,
 
 void FusedField::forward(const float* points, size_t count, float* values) {
     const Lock lock(mutex_);
-    for_each_block(count, static_cast<size_t>(backend_->block), [&](int thread, size_t first, int samples) {
+    for_each_block(count, backend_->block, [&](int thread, size_t first, int samples) {
         backend_->forward(shape_, packed_.data(), workspaces_[thread].data(), points + 3 * first,
                           samples, Keep::kNothing, values + 4 * first);
     });
@@ -167,7 +167,7 @@ void FusedField::evaluate_with_gradient(const float* points, size_t count, float
         distance_seed[4 * s] = 1.0f;
         copy(kLuma, 3, luma_seed + 4 * s + 1);
     }
-    for_each_block(count, static_cast<size_t>(backend_->block), [&](int thread, size_t first, int samples) {
+    for_each_block(count, backend_->block, [&](int thread, size_t first, int samples) {
         void* const workspace = workspaces_[thread].data();
         backend_->forward(shape_, packed_.data(), workspace, points + 3 * first, samples,
                           Keep::kSlopes, values + 4 * first);
@@ -185,7 +185,7 @@ void FusedField::backward(const float* points, size_t count, const float* grad_v
     const Lock lock(mutex_);
     uncollected_ = true;
     AlignedArray<float> values(4 * static_cast<size_t>(backend_->block * pool_.threads()));
-    for_each_block(count, static_cast<size_t>(backend_->block), [&](int thread, size_t first, int samples) {
+    for_each_block(count, backend_->block, [&](int thread, size_t first, int samples) {
         void* const workspace = workspaces_[thread].data();
         backend_->forward(shape_, packed_.data(), workspace, points + 3 * first, samples,
                           Keep::kAll, values.data() + 4 * thread * backend_->block);

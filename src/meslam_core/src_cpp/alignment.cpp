@@ -8,8 +8,8 @@ namespace {
 
 void to_map(const double* matrix, const float* gradient, double* result) {
     for (int j = 0; j < 3; ++j) {
-        result[j] = gradient[0] * matrix[j] + gradient[1] * matrix[3 + j] +
-                    gradient[2] * matrix[6 + j];
+        result[j] =
+            gradient[0] * matrix[j] + gradient[1] * matrix[3 + j] + gradient[2] * matrix[6 + j];
     }
 }
 
@@ -61,12 +61,11 @@ void normal_equations(const AlignmentSettings& settings, const AlignmentPoints& 
         const float* const arm = points.arms + 3 * i;
         double direction[3];
         to_map(settings.to_map, points.grad_distance + 3 * i, direction);
-        const double slope =
-            std::sqrt(direction[0] * direction[0] + direction[1] * direction[1] +
-                      direction[2] * direction[2]);
+        const double slope = std::sqrt(direction[0] * direction[0] + direction[1] * direction[1] +
+                                       direction[2] * direction[2]);
         const double weight = points.weights[i];
-        usable[i] = weight > 0.0 && std::fabs(value[0]) < settings.saturation &&
-                    slope > settings.min_slope;
+        usable[i] =
+            weight > 0.0 && std::fabs(value[0]) < settings.saturation && slope > settings.min_slope;
         const double divisor = std::max(slope, 1e-6);
         const double residual = (value[0] - settings.surface_level) / divisor;
         distance[i] = static_cast<float>(residual);

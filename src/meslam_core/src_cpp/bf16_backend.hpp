@@ -48,9 +48,19 @@ void restore_thread_state(const void*) {}
 #endif
 
 constexpr Backend make_bf16_backend(const char* name) {
-    return {name,    kBlock,   packed_bytes,      workspace_bytes,      accumulator_floats,
-            pack,    keep_thread_state, restore_thread_state, forward, backward,
-            collect, all_finite,        adam};
+    return {name,
+            kBlock,
+            packed_bytes,
+            workspace_bytes,
+            accumulator_floats,
+            pack,
+            keep_thread_state,
+            restore_thread_state,
+            forward,
+            backward,
+            collect,
+            all_finite,
+            adam};
 }
 
 }  // namespace

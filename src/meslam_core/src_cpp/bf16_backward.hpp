@@ -34,7 +34,8 @@ void sum_slopes(const Workspace& work, const Accumulator& sums, int groups) {
     for (int group = 0; group < groups; ++group) {
         const float* const from = work.slopes + 4 * kGroup * group;
         __m512 v[8];
-        MESLAM_UNROLL for (int i = 0; i < 8; ++i) {
+        MESLAM_UNROLL
+        for (int i = 0; i < 8; ++i) {
             v[i] = _mm512_load_ps(from + i * kLanes);
             total += v[i];
         }
@@ -75,7 +76,8 @@ void descend(const Workspace& work, int layer, const Term& term, int groups, Bf1
                 const Bf16* const gate = active + (tile_row * active_tiles + feature_group) * kTile;
                 Bf16* const tile = rows + (tile_row * row_tiles + feature_group) * kTile;
                 __m512i gradient[2];
-                MESLAM_UNROLL for (int odd = 0; odd < 2; ++odd) {
+                MESLAM_UNROLL
+                for (int odd = 0; odd < 2; ++odd) {
                     const float* const here = from + odd * kSide;
                     const __m512i gates = load_row(gate, row % kSide + odd);
                     gradient[odd] = _mm512_maskz_mov_epi16(
@@ -115,19 +117,24 @@ void finish_embedding(const NetworkShape& shape, const PackedWeights& packed, co
                                       first / kSide * work.embedding_tiles * kSums +
                                       first % kSide * kSide;
         Vector to_points[kAtOnce][3];
-        MESLAM_UNROLL for (int i = 0; i < kAtOnce; ++i) {
-            MESLAM_UNROLL for (int axis = 0; axis < 3; ++axis) to_points[i][axis] = Vector{};
+        MESLAM_UNROLL
+        for (int i = 0; i < kAtOnce; ++i) {
+            MESLAM_UNROLL
+            for (int axis = 0; axis < 3; ++axis) to_points[i][axis] = Vector{};
         }
         for (int j = 0; j < e; j += kLanes) {
             Vector b[3], sums[4];
-            MESLAM_UNROLL for (int axis = 0; axis < 3; ++axis) {
+            MESLAM_UNROLL
+            for (int axis = 0; axis < 3; ++axis) {
                 b[axis] = load(packed.directions + axis * e + j);
                 if (kWithWeights) sums[axis] = load(frequency + axis * e + j);
             }
             if (kWithWeights) sums[3] = load(frequency + 3 * e + j);
-            MESLAM_UNROLL for (int i = 0; i < kAtOnce; ++i) {
+            MESLAM_UNROLL
+            for (int i = 0; i < kAtOnce; ++i) {
                 const Vector angle = load(gradient + j / kSide * kSums + i * kSide);
-                MESLAM_UNROLL for (int axis = 0; axis < 3; ++axis) {
+                MESLAM_UNROLL
+                for (int axis = 0; axis < 3; ++axis) {
                     to_points[i][axis] += angle * b[axis];
                     if (kWithWeights) {
                         sums[axis] += work.points[4 * (first + i) + axis] * angle;
@@ -136,7 +143,8 @@ void finish_embedding(const NetworkShape& shape, const PackedWeights& packed, co
                 if (kWithWeights) sums[3] += angle;
             }
             if (kWithWeights) {
-                MESLAM_UNROLL for (int axis = 0; axis < 4; ++axis) {
+                MESLAM_UNROLL
+                for (int axis = 0; axis < 4; ++axis) {
                     store(frequency + axis * e + j, sums[axis]);
                 }
             }

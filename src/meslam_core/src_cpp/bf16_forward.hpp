@@ -35,8 +35,7 @@ void embed(const NetworkShape& shape, const PackedWeights& packed, const Workspa
                 Vector sine[2], cosine[2];
                 for (int half = 0; half < 2; ++half) {
                     const Vector z =
-                        p[0] * b[0][half] +
-                        (p[1] * b[1][half] + (p[2] * b[2][half] + phase[half]));
+                        p[0] * b[0][half] + (p[1] * b[1][half] + (p[2] * b[2][half] + phase[half]));
                     sine_and_cosine_of_pi(z, sine[half], cosine[half]);
                     if (kWithCosine) {
                         store(cosines + sample / kSide * work.embedding_tiles * kSums +
@@ -126,8 +125,8 @@ void forward_block(const NetworkShape& shape, const PackedWeights& packed, const
     for (int group = 0; group < groups; ++group) {
         const Factor left{work.hidden_rows[3] + 2 * group * hidden_side, hidden_side, kTile};
         const Term term[1] = {{left, {packed.forward[4], 0, kTile}, hidden_steps}};
-        multiply_group<2, 1, 1, Start::kBias>(term, packed.bias[4],
-                                              work.narrow + 2 * group * kSums, kSums);
+        multiply_group<2, 1, 1, Start::kBias>(term, packed.bias[4], work.narrow + 2 * group * kSums,
+                                              kSums);
     }
     finish_values(work, count, values);
 }

@@ -42,8 +42,8 @@ struct PackedWeights {
 
 struct Workspace {
     int hidden_tiles, joined_tiles, embedding_tiles;  // of 16 features
-    float* points;  // (block,4): x, y, z, 0
-    float* values;  // (block,4)
+    float* points;                                    // (block,4): x, y, z, 0
+    float* values;                                    // (block,4)
     float* slopes;  // (block,4): gradient with respect to the output layer's sums
     float* narrow;  // the output layer's sums in tiles
     float* cosine;  // in tiles of 16 samples by 16 features, as the next
@@ -109,13 +109,9 @@ struct Accumulator {
     }
 };
 
-size_t packed_bytes(const NetworkShape& shape) {
-    return PackedWeights(shape, nullptr).end;
-}
+size_t packed_bytes(const NetworkShape& shape) { return PackedWeights(shape, nullptr).end; }
 
-size_t workspace_bytes(const NetworkShape& shape) {
-    return Workspace(shape, nullptr).end;
-}
+size_t workspace_bytes(const NetworkShape& shape) { return Workspace(shape, nullptr).end; }
 
 size_t accumulator_floats(const NetworkShape& shape) {
     return Accumulator(shape, nullptr).end / sizeof(float);
@@ -163,7 +159,8 @@ void collect(const NetworkShape& shape, float* sums, float* gradients) {
     for (int layer = 0; layer < 4; ++layer) {
         collect_tiles(from.weight[layer], w, inputs[layer], gradients + weights[layer]);
         for (int i = 0; i < w; ++i) {
-            // Entry i of a group of 32: tile i/16, and within it lanes of four (see bf16_tiles.hpp).
+            // Entry i of a group of 32: tile i/16, and within it lanes of four (see
+            // bf16_tiles.hpp).
             const int half = i / 16 % 2, lane = i % 16;
             gradients[biases[layer] + i / kGroup * kGroup + lane / 4 * 8 + half * 4 + lane % 4] +=
                 from.bias[layer][i];

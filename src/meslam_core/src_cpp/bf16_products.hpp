@@ -110,8 +110,10 @@ MESLAM_INLINE void multiply_group(const Term* terms, const float* bias, float* s
         const int row_tile = first / kSide, row = first % kSide;
         float* const to = sums + row_tile * sums_row + row * kSide;
         __m512 sum[kAtOnce][kColumns];
-        MESLAM_UNROLL for (int i = 0; i < kAtOnce; ++i) {
-            MESLAM_UNROLL for (int j = 0; j < kColumns; ++j) {
+        MESLAM_UNROLL
+        for (int i = 0; i < kAtOnce; ++i) {
+            MESLAM_UNROLL
+            for (int j = 0; j < kColumns; ++j) {
                 if (kStart == Start::kZero) sum[i][j] = _mm512_setzero_ps();
                 if (kStart == Start::kBias) sum[i][j] = _mm512_loadu_ps(bias + j * kSide);
                 if (kStart == Start::kSums) sum[i][j] = _mm512_load_ps(to + j * kSums + i * kSide);
@@ -125,22 +127,27 @@ MESLAM_INLINE void multiply_group(const Term* terms, const float* bias, float* s
             for (int k = 0; k < terms[term].steps; ++k, a += left.depth, b += right.depth) {
                 for (int pair = 0; pair < kSide; ++pair) {
                     __m512bh right_pairs[kColumns];
-                    MESLAM_UNROLL for (int j = 0; j < kColumns; ++j) {
+                    MESLAM_UNROLL
+                    for (int j = 0; j < kColumns; ++j) {
                         right_pairs[j] = (__m512bh)load_row(b + j * right.side, pair);
                     }
-                    MESLAM_UNROLL for (int i = 0; i < kAtOnce; ++i) {
+                    MESLAM_UNROLL
+                    for (int i = 0; i < kAtOnce; ++i) {
                         int32_t numbers;
                         memcpy(&numbers, a + i * kGroup + 2 * pair, sizeof numbers);
                         const __m512bh left_pair = (__m512bh)_mm512_set1_epi32(numbers);
-                        MESLAM_UNROLL for (int j = 0; j < kColumns; ++j) {
+                        MESLAM_UNROLL
+                        for (int j = 0; j < kColumns; ++j) {
                             sum[i][j] = _mm512_dpbf16_ps(sum[i][j], left_pair, right_pairs[j]);
                         }
                     }
                 }
             }
         }
-        MESLAM_UNROLL for (int i = 0; i < kAtOnce; ++i) {
-            MESLAM_UNROLL for (int j = 0; j < kColumns; ++j) {
+        MESLAM_UNROLL
+        for (int i = 0; i < kAtOnce; ++i) {
+            MESLAM_UNROLL
+            for (int j = 0; j < kColumns; ++j) {
                 _mm512_store_ps(to + j * kSums + i * kSide, sum[i][j]);
             }
         }
@@ -186,9 +193,8 @@ void accumulate(int row_tiles, int column_tiles, const Term& term, float* sums) 
     for (int row = 0; row < row_tiles; row += kRows) {
         for (int column = 0; column < column_tiles; column += 2) {
             const Term here[1] = {{term.left.at(row), term.right.at(column), term.steps}};
-            multiply_group<kRows, 2, 1, Start::kSums>(here, nullptr,
-                                                      sums + row * sums_row + column * kSums,
-                                                      sums_row);
+            multiply_group<kRows, 2, 1, Start::kSums>(
+                here, nullptr, sums + row * sums_row + column * kSums, sums_row);
         }
     }
 }

@@ -24,10 +24,10 @@ namespace {
 
 typedef uint16_t Bf16;
 
-constexpr int kTile = 512;   // numbers of a bfloat16 tile
-constexpr int kSums = 256;   // numbers of a single-precision tile, 16 by 16
-constexpr int kSide = 16;    // rows of a tile
-constexpr int kGroup = 32;   // samples or features handled together: two tiles' sides
+constexpr int kTile = 512;  // numbers of a bfloat16 tile
+constexpr int kSums = 256;  // numbers of a single-precision tile, 16 by 16
+constexpr int kSide = 16;   // rows of a tile
+constexpr int kGroup = 32;  // samples or features handled together: two tiles' sides
 
 // low in the lower half.
 MESLAM_INLINE __m512i to_bf16(__m512 low, __m512 high) {
@@ -45,24 +45,29 @@ MESLAM_INLINE void store_row(Bf16* tile, int row, __m512i numbers) {
 // 16 by 16 transposition of 32-bit elements: pairs to columns, and weights to right factors.
 MESLAM_INLINE void transpose_tile(const Bf16* from, Bf16* to) {
     __m512i a[16], b[16];
-    MESLAM_UNROLL for (int i = 0; i < 16; ++i) a[i] = load_row(from, i);
-    MESLAM_UNROLL for (int i = 0; i < 8; ++i) {
+    MESLAM_UNROLL
+    for (int i = 0; i < 16; ++i) a[i] = load_row(from, i);
+    MESLAM_UNROLL
+    for (int i = 0; i < 8; ++i) {
         b[2 * i] = _mm512_unpacklo_epi32(a[2 * i], a[2 * i + 1]);
         b[2 * i + 1] = _mm512_unpackhi_epi32(a[2 * i], a[2 * i + 1]);
     }
-    MESLAM_UNROLL for (int i = 0; i < 4; ++i) {
+    MESLAM_UNROLL
+    for (int i = 0; i < 4; ++i) {
         a[4 * i] = _mm512_unpacklo_epi64(b[4 * i], b[4 * i + 2]);
         a[4 * i + 1] = _mm512_unpackhi_epi64(b[4 * i], b[4 * i + 2]);
         a[4 * i + 2] = _mm512_unpacklo_epi64(b[4 * i + 1], b[4 * i + 3]);
         a[4 * i + 3] = _mm512_unpackhi_epi64(b[4 * i + 1], b[4 * i + 3]);
     }
-    MESLAM_UNROLL for (int i = 0; i < 4; ++i) {
+    MESLAM_UNROLL
+    for (int i = 0; i < 4; ++i) {
         b[i] = _mm512_shuffle_i32x4(a[i], a[i + 4], 0x88);
         b[i + 4] = _mm512_shuffle_i32x4(a[i], a[i + 4], 0xdd);
         b[i + 8] = _mm512_shuffle_i32x4(a[i + 8], a[i + 12], 0x88);
         b[i + 12] = _mm512_shuffle_i32x4(a[i + 8], a[i + 12], 0xdd);
     }
-    MESLAM_UNROLL for (int i = 0; i < 8; ++i) {
+    MESLAM_UNROLL
+    for (int i = 0; i < 8; ++i) {
         store_row(to, i, _mm512_shuffle_i32x4(b[i], b[i + 8], 0x88));
         store_row(to, i + 8, _mm512_shuffle_i32x4(b[i], b[i + 8], 0xdd));
     }
@@ -113,9 +118,8 @@ void collect_tiles(const float* sums, int rows, int columns, float* gradient) {
     const __m512i second = _mm512_add_epi32(first, _mm512_set1_epi32(8));
     for (int row = 0; row < rows; ++row) {
         const int half = row / 4 % 2, place = row % kGroup / 8 * 4 + row % 4;
-        const float* from = sums +
-                            (row / kGroup * 2 + half) * ptrdiff_t{columns} * kSide +
-                            place * kSide;
+        const float* from =
+            sums + (row / kGroup * 2 + half) * ptrdiff_t{columns} * kSide + place * kSide;
         float* const to = gradient + row * ptrdiff_t{columns};
         for (int column = 0; column < columns; column += kGroup, from += 2 * kSums) {
             const __m512 a = _mm512_load_ps(from), b = _mm512_load_ps(from + kSums);

@@ -36,7 +36,7 @@ inline void check_floats(const py::array& array, const char* name) {
 
 // The numbers of an array of shape (rows, columns); any number of rows where rows is negative.
 inline const float* matrix(const py::array& array, const char* name, py::ssize_t rows,
-                    py::ssize_t columns) {
+                           py::ssize_t columns) {
     check_floats(array, name);
     if (array.ndim() != 2 || array.shape(1) != columns || (rows >= 0 && array.shape(0) != rows)) {
         const std::string expected = rows < 0 ? "N" : std::to_string(rows);

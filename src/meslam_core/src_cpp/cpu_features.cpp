@@ -63,14 +63,13 @@ CpuFeatures detect() {
     const uint32_t features_b = b, features_d = d;
     found.avx2 = features_b & (1u << 5);
     constexpr uint32_t kFoundationDqBwVl = (1u << 16) | (1u << 17) | (1u << 30) | (1u << 31);
-    found.avx512 =
-        found.avx2 && all(0xe6) && (features_b & kFoundationDqBwVl) == kFoundationDqBwVl;
+    found.avx512 = found.avx2 && all(0xe6) && (features_b & kFoundationDqBwVl) == kFoundationDqBwVl;
     if (!found.avx512 || !__get_cpuid_count(7, 1, &a, &b, &c, &d)) return found;
     found.avx512bf16 = a & (1u << 5);
     found.fast_pairs = made_by_amd();
     constexpr uint32_t kTilesAndBf16 = (1u << 24) | (1u << 22);
-    found.amx = found.avx512bf16 && (features_d & kTilesAndBf16) == kTilesAndBf16 &&
-                all(0x60000) && request_tile_registers();
+    found.amx = found.avx512bf16 && (features_d & kTilesAndBf16) == kTilesAndBf16 && all(0x60000) &&
+                request_tile_registers();
     return found;
 }
 

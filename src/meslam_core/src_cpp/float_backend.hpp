@@ -83,13 +83,9 @@ struct Workspace {
     }
 };
 
-size_t packed_bytes(const NetworkShape& shape) {
-    return PackedWeights(shape, nullptr).end;
-}
+size_t packed_bytes(const NetworkShape& shape) { return PackedWeights(shape, nullptr).end; }
 
-size_t workspace_bytes(const NetworkShape& shape) {
-    return Workspace(shape, nullptr).end;
-}
+size_t workspace_bytes(const NetworkShape& shape) { return Workspace(shape, nullptr).end; }
 
 // The parameters' own order, but for B, which is transposed: (3,E).
 size_t accumulator_floats(const NetworkShape& shape) { return shape.parameters; }
@@ -271,10 +267,9 @@ void backward(const NetworkShape& shape, const void* packed_memory, void* worksp
                                         {accumulator + shape.frequency, e, nullptr, 0});
     }
     if (grad_points != nullptr) {
-        multiply<Epilogue::kStore, 1>(count, kLanes, e,
-                                      {work.embedding_gradient, work.embedding_row, 1},
-                                      {packed.back_to_point, kLanes, 0},
-                                      {work.narrow, kLanes, nullptr, 0});
+        multiply<Epilogue::kStore, 1>(
+            count, kLanes, e, {work.embedding_gradient, work.embedding_row, 1},
+            {packed.back_to_point, kLanes, 0}, {work.narrow, kLanes, nullptr, 0});
         for (int s = 0; s < count; ++s) {
             memcpy(grad_points + 3 * s, work.narrow + s * kLanes, 3 * sizeof(float));
         }
@@ -297,9 +292,19 @@ void keep_thread_state(void*) {}
 void restore_thread_state(const void*) {}
 
 constexpr Backend make_float_backend(const char* name) {
-    return {name,    kBlock,   packed_bytes,      workspace_bytes,      accumulator_floats,
-            pack,    keep_thread_state, restore_thread_state, forward, backward,
-            collect, all_finite,        adam};
+    return {name,
+            kBlock,
+            packed_bytes,
+            workspace_bytes,
+            accumulator_floats,
+            pack,
+            keep_thread_state,
+            restore_thread_state,
+            forward,
+            backward,
+            collect,
+            all_finite,
+            adam};
 }
 
 }  // namespace

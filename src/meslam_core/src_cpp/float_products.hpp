@@ -45,11 +45,13 @@ struct Target {
 
 template <Epilogue kEpilogue, int kRows, int kVectors>
 MESLAM_INLINE void multiply_tile(const Left& left, const float* right, ptrdiff_t right_depth,
-                                 int depth, float* target, ptrdiff_t target_row,
-                                 const float* extra, ptrdiff_t extra_row) {
+                                 int depth, float* target, ptrdiff_t target_row, const float* extra,
+                                 ptrdiff_t extra_row) {
     Vector sums[kRows][kVectors];
-    MESLAM_UNROLL for (int i = 0; i < kRows; ++i) {
-        MESLAM_UNROLL for (int j = 0; j < kVectors; ++j) {
+    MESLAM_UNROLL
+    for (int i = 0; i < kRows; ++i) {
+        MESLAM_UNROLL
+        for (int j = 0; j < kVectors; ++j) {
             if (kEpilogue == Epilogue::kBias || kEpilogue == Epilogue::kBiasRelu) {
                 sums[i][j] = load(extra + j * kLanes);
             } else {
@@ -60,16 +62,21 @@ MESLAM_INLINE void multiply_tile(const Left& left, const float* right, ptrdiff_t
     const float* a = left.start;
     for (int k = 0; k < depth; ++k) {
         Vector b[kVectors];
-        MESLAM_UNROLL for (int j = 0; j < kVectors; ++j) b[j] = load(right + j * kLanes);
-        MESLAM_UNROLL for (int i = 0; i < kRows; ++i) {
+        MESLAM_UNROLL
+        for (int j = 0; j < kVectors; ++j) b[j] = load(right + j * kLanes);
+        MESLAM_UNROLL
+        for (int i = 0; i < kRows; ++i) {
             const Vector factor = broadcast(a[i * left.row]);
-            MESLAM_UNROLL for (int j = 0; j < kVectors; ++j) sums[i][j] += factor * b[j];
+            MESLAM_UNROLL
+            for (int j = 0; j < kVectors; ++j) sums[i][j] += factor * b[j];
         }
         a += left.depth;
         right += right_depth;
     }
-    MESLAM_UNROLL for (int i = 0; i < kRows; ++i) {
-        MESLAM_UNROLL for (int j = 0; j < kVectors; ++j) {
+    MESLAM_UNROLL
+    for (int i = 0; i < kRows; ++i) {
+        MESLAM_UNROLL
+        for (int j = 0; j < kVectors; ++j) {
             float* to = target + i * target_row + j * kLanes;
             Vector sum = sums[i][j];
             if (kEpilogue == Epilogue::kBiasRelu) sum = relu(sum);

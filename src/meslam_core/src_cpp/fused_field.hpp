@@ -25,7 +25,8 @@ struct AdamOptions {
     float encoding_scale;
 };
 
-// Rays in region coordinates with their samples; what lies at a sample is origin + along * direction.
+// Rays in region coordinates with their samples; what lies at a sample is origin + along *
+// direction.
 struct RayBatch {
     size_t rays;
     int samples;
@@ -64,16 +65,15 @@ public:
     // Repeats the forward pass block by block, adds to the gradients, writes grad_points (count,3)
     // unless it is null.
     void backward(const float* points, size_t count, const float* grad_values, float* grad_points);
-    // Forward pass, rendering, losses and backward pass of rays in one go. The gradients are those of
-    // the mean over the rays of weight times loss. Writes losses (rays,3), before the weights, and
-    // grad_origins and grad_directions (rays,3).
+    // Forward pass, rendering, losses and backward pass of rays in one go. The gradients are those
+    // of the mean over the rays of weight times loss. Writes losses (rays,3), before the weights,
+    // and grad_origins and grad_directions (rays,3).
     void train_rays(const RaySettings& settings, const RayBatch& batch, float* losses,
                     float* grad_origins, float* grad_directions);
     // The same from cameras' poses, with samples drawn here; writes losses (rays,3) and grad_twists
     // (poses,6), see posed_rays.hpp.
     void train_posed_rays(const RaySettings& settings, const SamplingSettings& sampling,
-                          uint64_t seed, const PosedRays& rays, float* losses,
-                          float* grad_twists);
+                          uint64_t seed, const PosedRays& rays, float* losses, float* grad_twists);
     // See alignment.hpp; `measured` needs no values and gradients: they are computed at points.
     void normal_equations(const AlignmentSettings& settings, const float* points,
                           AlignmentPoints measured, double* information, double* gradient,

@@ -10,8 +10,8 @@ namespace meslam {
 struct NetworkShape {
     int width;
     int embedding;
-    // Starts in the flat float32 vector, in its order: B (E,3), phi (E), W1 (W,E), b1, W2 (W,W), b2,
-    // W3 (W,W+E) with the columns of h2 first, b3, W4 (W,W), b4, W5 (4,W), b5 (4).
+    // Starts in the flat float32 vector, in its order: B (E,3), phi (E), W1 (W,E), b1, W2 (W,W),
+    // b2, W3 (W,W+E) with the columns of h2 first, b3, W4 (W,W), b4, W5 (4,W), b5 (4).
     size_t frequency, phase;
     size_t weight1, bias1;
     size_t weight2, bias2;

@@ -41,8 +41,8 @@ RegionRays to_region(const PosedRays& rays) {
     return result;
 }
 
-void twist_gradients(const PosedRays& rays, const float* grad_origins,
-                     const float* grad_directions, float* grad_twists) {
+void twist_gradients(const PosedRays& rays, const float* grad_origins, const float* grad_directions,
+                     float* grad_twists) {
     std::vector<double> sums(6 * rays.poses, 0.0);
     for (size_t ray = 0; ray < rays.rays; ++ray) {
         const size_t pose = static_cast<size_t>(rays.pose[ray]);

@@ -1,4 +1,5 @@
-// Rays in the cameras' frames with the cameras' poses, and their way to region coordinates and back.
+// Rays in the cameras' frames with the cameras' poses, and their way to region coordinates and
+// back.
 #pragma once
 
 #include <cstddef>
@@ -30,7 +31,7 @@ RegionRays to_region(const PosedRays& rays);
 
 // grad_twists (poses,6): gradients of small moves (translation [m], rotation [rad]) of the cameras
 // about their centres, map axes, from those of origins and directions in region coordinates.
-void twist_gradients(const PosedRays& rays, const float* grad_origins,
-                     const float* grad_directions, float* grad_twists);
+void twist_gradients(const PosedRays& rays, const float* grad_origins, const float* grad_directions,
+                     float* grad_twists);
 
 }  // namespace meslam

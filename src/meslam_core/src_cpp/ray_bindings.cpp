@@ -124,8 +124,7 @@ py::tuple align(FusedField& field, const py::array& points, const py::array& arm
         throw py::value_error("to_map has shape " + describe_shape(to_map) +
                               "; (3, 3) is expected");
     }
-    AlignmentSettings settings{{},        surface_level, saturation,
-                               min_slope, huber,         color_weight};
+    AlignmentSettings settings{{}, surface_level, saturation, min_slope, huber, color_weight};
     for (int i = 0; i < 9; ++i) settings.to_map[i] = to_map.data()[i];
     py::array_t<double> information({6, 6});
     py::array_t<double> gradient(6);
@@ -167,12 +166,12 @@ void bind_rays(py::module_& module, py::class_<FusedField>& field) {
              py::arg("weights") = py::none())
         .def("train_posed_rays", train_posed_rays, py::arg("settings"), py::arg("sampling"),
              py::arg("seed"), py::arg("rotations"), py::arg("translations"), py::arg("pose"),
-             py::arg("directions"), py::arg("distances"), py::arg("colors"),
-             py::arg("to_region"), py::arg("weights") = py::none())
-        .def("normal_equations", align, py::arg("points"), py::arg("arms"),
-             py::arg("luma"), py::arg("weights"), py::kw_only(), py::arg("to_map"),
-             py::arg("surface_level"), py::arg("saturation"), py::arg("min_slope"),
-             py::arg("huber"), py::arg("color_weight"));
+             py::arg("directions"), py::arg("distances"), py::arg("colors"), py::arg("to_region"),
+             py::arg("weights") = py::none())
+        .def("normal_equations", align, py::arg("points"), py::arg("arms"), py::arg("luma"),
+             py::arg("weights"), py::kw_only(), py::arg("to_map"), py::arg("surface_level"),
+             py::arg("saturation"), py::arg("min_slope"), py::arg("huber"),
+             py::arg("color_weight"));
 }
 
 }  // namespace meslam

@@ -78,10 +78,9 @@ void ray_losses(const RaySettings& settings, const RayMeasurement& measured, int
         const float* const value = values + 4 * i;
         float* const gradient = grad_values + 4 * i;
         const float light = gradient[0], weight = gradient[1];
-        const float target =
-            std::clamp((along[i] - measured.distance + settings.surface_offset) /
-                           settings.truncation,
-                       -1.0f, 1.0f);
+        const float target = std::clamp(
+            (along[i] - measured.distance + settings.surface_offset) / settings.truncation, -1.0f,
+            1.0f);
         const float error = value[0] - target;
         distance_loss += distance_scale * std::fabs(error);
         // Of the sum of the losses with respect to this interval's weight.

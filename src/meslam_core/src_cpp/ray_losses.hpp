@@ -4,13 +4,13 @@
 namespace meslam {
 
 struct RaySettings {
-    float density_scale;     // of the positive part of f [1/m]
-    float truncation;        // distance at which the target saturates [m]
-    float surface_offset;    // how far before the surface f crosses zero [m]
-    float distance_weight;   // of the signed-distance loss
-    float depth_weight;      // of the rendered-depth loss
-    float color_weight;      // of the rendered-colour loss
-    float depth_clip;        // rendered-depth errors count up to this [m]
+    float density_scale;    // of the positive part of f [1/m]
+    float truncation;       // distance at which the target saturates [m]
+    float surface_offset;   // how far before the surface f crosses zero [m]
+    float distance_weight;  // of the signed-distance loss
+    float depth_weight;     // of the rendered-depth loss
+    float color_weight;     // of the rendered-colour loss
+    float depth_clip;       // rendered-depth errors count up to this [m]
 };
 
 struct RayMeasurement {

@@ -39,8 +39,8 @@ private:
 
 }  // namespace
 
-void sample_rays(const SamplingSettings& settings, uint64_t seed, size_t rays, const float* distances,
-                 float* along) {
+void sample_rays(const SamplingSettings& settings, uint64_t seed, size_t rays,
+                 const float* distances, float* along) {
     const int samples = settings.free_samples + settings.surface_samples;
     for (size_t i = 0; i < rays; ++i, along += samples) {
         SplitMix random(seed, i);

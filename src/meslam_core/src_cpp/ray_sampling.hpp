@@ -14,7 +14,7 @@ struct SamplingSettings {
 
 // along (rays, free + surface samples), ascending [m], of rays that end at distances [m]. A ray's
 // random numbers depend on the seed and its number alone.
-void sample_rays(const SamplingSettings& settings, uint64_t seed, size_t rays, const float* distances,
-                 float* along);
+void sample_rays(const SamplingSettings& settings, uint64_t seed, size_t rays,
+                 const float* distances, float* along);
 
 }  // namespace meslam

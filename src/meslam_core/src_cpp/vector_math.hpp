@@ -52,10 +52,9 @@ MESLAM_INLINE void sine_and_cosine_of_pi(Vector x, Vector& sine, Vector& cosine)
         r * (3.141592580e+00f +
              u * (-5.167706879e+00f +
                   u * (2.550031377e+00f + u * (-5.980451718e-01f + u * 7.722012434e-02f))));
-    const Vector c =
-        9.999999535e-01f +
-        u * (-4.934792859e+00f +
-             u * (4.058411915e+00f + u * (-1.331880163e+00f + u * 2.196967985e-01f)));
+    const Vector c = 9.999999535e-01f +
+                     u * (-4.934792859e+00f +
+                          u * (4.058411915e+00f + u * (-1.331880163e+00f + u * 2.196967985e-01f)));
     sine = reinterpret_cast<Vector>(reinterpret_cast<IntVector>(s) ^ sign);
     cosine = reinterpret_cast<Vector>(reinterpret_cast<IntVector>(c) ^ sign);
 }

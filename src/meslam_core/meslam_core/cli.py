@@ -7,10 +7,8 @@ user interrupted a run. Messages go to standard error, results to standard outpu
 
 from __future__ import annotations
 
-import json
 import logging
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,17 +16,20 @@ import typer
 from typer.core import TyperGroup
 
 from meslam_core import __version__
+from meslam_core.command_output import (
+    BAD_INPUT,
+    complain,
+    exit_after_run,
+    exit_if_damaged,
+    print_entries,
+    run_summary,
+)
 from meslam_core.errors import ConfigError, MeslamError
 
 # Torch and Open3D take seconds to import, so every command imports what it needs itself.
 if TYPE_CHECKING:
     from meslam_core.camera import PinholeCamera
     from meslam_core.map.neural_map import NeuralMap
-    from meslam_core.pipeline import RunOutcome
-
-BAD_INPUT = 2
-TRACKING_LOST = 3
-INTERRUPTED = 130
 
 NEXT_STEPS = """\
 MeSLAM maps a room with an RGB-D camera and keeps the map in small neural networks.
@@ -52,7 +53,7 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except MeslamError as error:
-            _complain(str(error))
+            complain(str(error))
             raise typer.Exit(BAD_INPUT) from error
 
 
@@ -155,8 +156,8 @@ def run(
             outcome = pipeline.run(source, config, out, options, bar)
     finally:
         source.close()
-    _print(outcome.report, as_json, _run_summary(outcome.report, out))
-    _exit_with(outcome, out)
+    print_entries(outcome.report, as_json, run_summary(outcome.report, out))
+    exit_after_run(outcome, out)
 
 
 @app.command()
@@ -179,7 +180,7 @@ def evaluate(
     entries = trajectory_entries(
         read_tum(trajectory), read_tum(truth), tolerance_s=tolerance, hand_eye=lever_arm
     )
-    _print(entries, as_json)
+    print_entries(entries, as_json)
 
 
 @app.command()
@@ -198,7 +199,7 @@ def mesh(
         surface = extract_mesh(neural_map, resolution, progress=progress)
     write_mesh(surface, out)
     typer.echo(f"{out}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles")
-    _exit_if_damaged(stored, damaged)
+    exit_if_damaged(stored, damaged)
 
 
 @app.command()
@@ -220,7 +221,7 @@ def query(
     neural_map, damaged = _load_map(stored)
     write_answers(out, answer(neural_map, wanted))
     typer.echo(f"{out}: {len(wanted)} answers")
-    _exit_if_damaged(stored, damaged)
+    exit_if_damaged(stored, damaged)
 
 
 @app.command()
@@ -234,14 +235,14 @@ def info(
         from meslam_core.map_info import describe_map
 
         facts, damaged = describe_map(path)
-        _print(facts, as_json)
-        _exit_if_damaged(path, damaged)
+        print_entries(facts, as_json)
+        exit_if_damaged(path, damaged)
         return
     from meslam_core.recordings import describe, open_recording
 
     recording = open_recording(path, _camera(camera))
     try:
-        _print(describe(recording), as_json)
+        print_entries(describe(recording), as_json)
     finally:
         recording.close()
 
@@ -311,80 +312,6 @@ def _load_map(path: Path) -> tuple[NeuralMap, list[str]]:
 
     loaded = MapStore(path).load()
     return NeuralMap(loaded.regions), loaded.warnings
-
-
-def _exit_if_damaged(path: Path, damages: list[str]) -> None:
-    if damages:
-        for damage in damages:
-            _complain(damage)
-        _complain(f"{path} is damaged; the rest of the map was used. Restore it from a copy.")
-        raise typer.Exit(BAD_INPUT)
-
-
-def _exit_with(outcome: RunOutcome, out: Path) -> None:
-    """State what went wrong with a run that has results, and exit accordingly."""
-    frames, tracked = outcome.report["frames"], outcome.report["frames_tracked"]
-    status = 0
-    if outcome.interrupted:
-        _complain(f"interrupted after {frames} frames; the results so far are in {out}")
-        status = INTERRUPTED
-    if outcome.lost:
-        _complain(
-            f"tracking was lost and never recovered; {tracked} of {frames} frames were tracked, "
-            f"their results are in {out}. Move the camera more slowly, over surfaces within range"
-        )
-        status = TRACKING_LOST
-    if outcome.not_evaluated:
-        _complain(f"no comparison with the truth: {outcome.not_evaluated}")
-        status = BAD_INPUT
-    if outcome.broke_off:
-        _complain(
-            f"the recording breaks off: {outcome.broke_off}; the results of the {frames} frames "
-            f"before are in {out}"
-        )
-        status = BAD_INPUT
-    if status:
-        raise typer.Exit(status)
-
-
-def _run_summary(report: Mapping[str, Any], out: Path) -> str:
-    lines = [
-        f"{report['frames_tracked']} of {report['frames']} frames tracked, "
-        f"{report['keyframes']} keyframes, {report['fps']:.1f} frames/s",
-        f"map of {report['observed_volume_m3']:.1f} m^3 in {report['regions']} region(s), "
-        f"{report['map_bytes'] / 1000:.1f} kB",
-    ]
-    if "ate_rmse_m" in report:
-        lines.append(
-            f"ATE {report['ate_rmse_m'] * 100:.2f} cm, online "
-            f"{report['ate_online_rmse_m'] * 100:.2f} cm over {report['poses_compared']} poses"
-        )
-    lines.append(f"results in {out}")
-    return "\n".join(lines)
-
-
-def _print(entries: Mapping[str, Any], as_json: bool, text: str | None = None) -> None:
-    if as_json:
-        typer.echo(json.dumps(entries, indent=2, allow_nan=False))
-    elif text is not None:
-        typer.echo(text)
-    else:
-        for name, value in entries.items():
-            typer.echo(f"{name:<18} {_readable(value)}")
-
-
-def _readable(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_readable(item)}" for key, item in value.items()) or "-"
-    if isinstance(value, list | tuple):
-        return ", ".join(_readable(item) for item in value) or "-"
-    return "-" if value is None else str(value)
-
-
-def _complain(message: str) -> None:
-    typer.echo(f"meslam: {message}", err=True)
 
 
 def _show_warnings() -> None:

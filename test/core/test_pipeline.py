@@ -21,20 +21,20 @@ from meslam_core.trajectory import read_tum
 class Watcher:
     """Progress that keeps what it is told and may act on it."""
 
-    def __init__(self, at_frame: int = 0, action=lambda: None) -> None:
+    def __init__(self, at: int | str = 0, action=lambda: None) -> None:
         self.told: list = []
-        self._at_frame, self._action = at_frame, action
+        self._at, self._action = at, action
 
     def started(self, frames: int) -> None:
         self.told.append(("started", frames))
 
     def processed(self, offered: int, result: FrameResult) -> None:
-        self.told.append(offered)
-        if offered == self._at_frame:
-            self._action()
+        self.stage(offered)
 
-    def stage(self, name: str) -> None:
+    def stage(self, name: int | str) -> None:
         self.told.append(name)
+        if name == self._at:
+            self._action()
 
 
 def covered(frame):
@@ -178,7 +178,7 @@ def test_a_recording_without_any_depth_has_no_map(quick_config, room_frames, tmp
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_keeps_what_it_has(quick_config, room_frames, tmp_path, number):
     usual = signal.getsignal(number)
-    watcher = Watcher(at_frame=3, action=lambda: os.kill(os.getpid(), number))
+    watcher = Watcher(at=3, action=lambda: os.kill(os.getpid(), number))
     outcome = run(MemoryRecording(room_frames), quick_config, tmp_path, progress=watcher)
     assert outcome.interrupted
     assert outcome.report["frames"] == 3
@@ -186,6 +186,13 @@ def test_an_interrupted_run_keeps_what_it_has(quick_config, room_frames, tmp_pat
     assert len(read_tum(tmp_path / "trajectory.txt")) == 3
     assert NeuralMap.load(tmp_path / "map.meslam").regions
     assert signal.getsignal(number) is usual
+
+
+def test_an_interruption_after_the_last_frame_costs_nothing(quick_config, room_frames, tmp_path):
+    watcher = Watcher(at="refining", action=lambda: os.kill(os.getpid(), signal.SIGINT))
+    outcome = run(MemoryRecording(room_frames[:3]), quick_config, tmp_path, progress=watcher)
+    assert not outcome.interrupted
+    assert len(read_tum(tmp_path / "trajectory.txt")) == 3
 
 
 def test_at_the_recordings_pace_late_frames_are_skipped_and_counted(

@@ -172,21 +172,21 @@ class _Loop:
     def run(self) -> None:
         """Feed the frames, then refine the map unless the user is in a hurry."""
         started = time.perf_counter()
-        try:
-            with _stop_request() as stop:
+        with _stop_request() as stop:
+            try:
                 self._feed(stop)
-        except (RecordingError, FrameError) as error:
+            except (RecordingError, FrameError) as error:
+                if not self.tally.frames:
+                    raise
+                self.broke_off = str(error)
             if not self.tally.frames:
-                raise
-            self.broke_off = str(error)
-        if not self.tally.frames:
-            raise RecordingError(
-                f"{self._recording.name}: the chosen frames are none of its "
-                f"{len(self._recording)} frames; choose others"
-            )
-        if not self.interrupted:
-            self._progress.stage("refining")
-            self._slam.finish()
+                raise RecordingError(
+                    f"{self._recording.name}: the chosen frames are none of its "
+                    f"{len(self._recording)} frames; choose others"
+                )
+            if not self.interrupted:
+                self._progress.stage("refining")
+                self._slam.finish()
         self.wall_s = time.perf_counter() - started
 
     def _feed(self, stop: threading.Event) -> None:

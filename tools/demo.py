@@ -59,7 +59,8 @@ MESH, PATH_PICTURE, ERROR_PICTURE, VIEWS_PICTURE = "mesh.ply", "path.png", "erro
 NODES_LOG, PLAYER_LOG = "nodes.log", "player.log"
 MESH_RESOLUTION_M = 0.02
 VIEWS = 3
-STARTING_S, FINISHING_S, SERVICE_S, SILENCE_S = 90.0, 60.0, 300.0, 120.0
+STARTING_S, FINISHING_S, SERVICE_S, SILENCE_S = 90.0, 120.0, 300.0, 120.0
+ARRIVAL_S = 1.0
 IMAGE_SUBSCRIBERS = 2
 LOG_LINES = 15
 HAS_POSE = (TrackingStatus.OK, TrackingStatus.DEGRADED)
@@ -211,8 +212,16 @@ def _collect(client: MeslamClient, slam: NodeProcess, playing_s: float) -> Live:
     listed: list[ListRegions.Response] = []
 
     def map_is_final() -> bool:
+        if not client.statuses[-1].settled:
+            return False
         listed.append(client.call(ListRegions, topics.LIST_REGIONS, timeout_s=SERVICE_S))
-        return stamp_ns(listed[-1].regions.header.stamp) >= last_ns
+        if stamp_ns(listed[-1].regions.header.stamp) < last_ns:
+            return False
+        # The last models are under way when tracking has settled; they are a second's matter.
+        time.sleep(ARRIVAL_S)
+        before = [region.version for region in listed[-1].regions.regions]
+        listed.append(client.call(ListRegions, topics.LIST_REGIONS, timeout_s=SERVICE_S))
+        return before == [region.version for region in listed[-1].regions.regions]
 
     _wait(client, slam, map_is_final, FINISHING_S, "the map does not arrive at the map server")
     _wait(client, slam, lambda: client.path_stamp_ns >= last_ns, FINISHING_S, "no final path comes")

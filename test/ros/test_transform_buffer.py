@@ -6,7 +6,7 @@ from tf2_msgs.msg import TFMessage
 
 from meslam_core.errors import FrameError
 from meslam_core.se3 import exp, interpolate, inverse
-from meslam_ros import topics
+from meslam_ros import topics, transform_buffer
 from meslam_ros.client import MeslamClient
 from meslam_ros.conversions import NANOSECONDS, to_stamp, to_transform
 from meslam_ros.qos import STREAM
@@ -23,11 +23,15 @@ def T_odom_base(second: float) -> np.ndarray:
 
 
 @pytest.fixture
-def buffer(client: MeslamClient) -> TransformBuffer:
+def buffer(client: MeslamClient, monkeypatch: pytest.MonkeyPatch) -> TransformBuffer:
     """Ten seconds of a robot that drives."""
+    # The test's only thread is the executor's.
+    monkeypatch.setattr(transform_buffer, "PATIENCE_S", 0.0)
     buffer = TransformBuffer(client.node)
     publisher = client.node.create_publisher(TFMessage, topics.TF, STREAM)
     client.static = StaticBroadcaster(client.node, T_BASE_CAMERA, "base", "camera")
+    with pytest.raises(FrameError):
+        buffer.lookup("map", "camera")
     assert client.spin_until(lambda: publisher.get_subscription_count() > 0, WAIT_S)
     for second in range(10):
         stamp = to_stamp(second * NANOSECONDS + 1)

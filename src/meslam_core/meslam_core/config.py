@@ -271,8 +271,10 @@ class KeyframesConfig:
 class MappingConfig:
     """Joint optimisation of weights and poses (Sec. II-B)."""
 
-    rays: int = setting(200, "rays of keyframes in a step", minimum=8, maximum=20000)
-    current_rays: int = setting(50, "rays of the current frame in a step", minimum=0, maximum=20000)
+    rays: int = setting(600, "rays of keyframes in a step", minimum=8, maximum=20000)
+    current_rays: int = setting(
+        150, "rays of the current frame in a step", minimum=0, maximum=20000
+    )
     free_samples: int = setting(5, "samples of a ray in free space", minimum=1, maximum=64)
     surface_samples: int = setting(4, "samples of a ray near the surface", minimum=1, maximum=64)
     surface_sigma_m: float = setting(
@@ -282,7 +284,7 @@ class MappingConfig:
     iterations: int = setting(16, "steps a frame", minimum=0, maximum=1000)
     keyframe_iterations: int = setting(40, "steps on a new keyframe", minimum=0, maximum=1000)
     final_iterations: int = setting(
-        500, "steps after the last frame of a recording", minimum=0, maximum=100000
+        1000, "steps after the last frame of a recording", minimum=0, maximum=100000
     )
     budget_ms: float = setting(
         0.0,
@@ -311,7 +313,7 @@ class MappingConfig:
         1.0, "weight of the rendered-colour loss", minimum=0.0, maximum=100.0
     )
     odometry_weight: float = setting(
-        30.0,
+        50.0,
         "weight of odometry between consecutive keyframes (squared error)",
         unit="1/m^2, 1/rad^2",
         minimum=0.0,

@@ -169,16 +169,28 @@ class Slam:
             mapping_ms=(mapped - tracked) * 1e3,
         )
 
-    def finish(self) -> None:
-        """Refine keyframes and map once more over everything seen; then update the masks."""
+    def refine(self, steps: int) -> None:
+        """Train on what was seen for `steps` steps, over all regions; keyframe poses follow."""
         if self.atlas is None:
             return
         total = sum(len(region.keyframes) for region in self.atlas.regions.values())
         for region in self.atlas.regions.values():
             share = len(region.keyframes) / max(total, 1)
-            self.optimizer.train(region, round(self.config.mapping.final_iterations * share))
+            self.optimizer.train(region, max(1, round(steps * share)))
             region.version += 1
+
+    def finish(self) -> None:
+        """Refine once more over everything seen; then mark the observed space anew."""
+        self.refine(self.config.mapping.final_iterations)
+        self.settle()
+
+    def settle(self) -> None:
+        """Mark the observed space anew where the refined keyframes saw it."""
+        if self.atlas is None:
+            return
         self.atlas.rebuild_masks()
+        for region in self.atlas.regions.values():
+            region.version += 1
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every tracked frame as it is known now."""

@@ -17,6 +17,8 @@ from meslam_core.trajectory import Trajectory
 from meslam_ros.odometry_messages import first_base_pose
 from meslam_ros.transforms import CameraMount
 
+# Short enough that the next image does not wait.
+IDLE_STEPS = 20
 WITH_POSE = (TrackingState.OK, TrackingState.DEGRADED)
 
 
@@ -44,6 +46,7 @@ class MappingSession:
         self._seed = seed
         self._slam: Slam | None = None
         self._mount: CameraMount | None = None
+        self._refined_steps = 0
 
     def process(
         self, frame: RgbdFrame, mount: CameraMount, odometry: OdometryEstimate | None
@@ -53,9 +56,20 @@ class MappingSession:
             T_map_camera = first_base_pose(mount) @ mount.T_base_optical
             self._slam, self._mount = Slam(self._config, self._seed, T_map_camera), mount
         self.received += 1
+        self._refined_steps = 0
         self.result = self._slam.process(frame, odometry)
         self.tracked += self.has_pose
         return self.result
+
+    def refine(self) -> bool:
+        """Refine the map for a moment while no image comes; False when that is done."""
+        if self._slam is None or self._refined_steps >= self._config.mapping.final_iterations:
+            return False
+        self._slam.refine(IDLE_STEPS)
+        self._refined_steps += IDLE_STEPS
+        if self._refined_steps >= self._config.mapping.final_iterations:
+            self._slam.settle()
+        return True
 
     @property
     def has_pose(self) -> bool:

@@ -153,15 +153,18 @@ class TrackingNode(ManagedNode):
         )
 
     def idle(self, silence_s: float) -> None:
-        """Publish what the bounded rates held back (`FrameConsumer`)."""
+        """Refine the map, then publish what the bounded rates held back (`FrameConsumer`)."""
         if self._reset_requested:
             self._begin()
         if self._all_published or silence_s < self._settings.idle_s:
+            return
+        if self._session.refine():
             return
         self._all_published = True
         assert self._session.result is not None
         self._models.offer(self._session.regions, self._session.result.stamp_ns, final=True)
         self._publish_path()
+        self._publish_status(self._latest_pair)
 
     def _odometry_of(self, frame: RgbdFrame, mount: CameraMount) -> OdometryEstimate | None:
         if not self.count_publishers(self._odometry_subscription.topic_name):
@@ -195,6 +198,7 @@ class TrackingNode(ManagedNode):
         status.drop_reasons = counts(dropped)
         status.queue_length = self._worker.waiting
         status.paused = self._paused
+        status.settled = self._all_published
         self._status.publish(status)
 
     def _publish_path(self) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 from bisect import bisect_left, insort
 from collections.abc import Iterator
 
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from tf2_msgs.msg import TFMessage
 
 from meslam_core import se3
@@ -22,6 +24,7 @@ HISTORY = 2000
 TF_DEPTH = 100
 MAX_EXTRAPOLATION_NS = NANOSECONDS // 2
 LATEST = 0
+PATIENCE_S = 1.0
 
 
 class _Edge:
@@ -62,20 +65,20 @@ class _Edge:
 
 
 class TransformBuffer:
-    """Collects /tf and /tf_static; may be asked from any thread."""
+    """Collects /tf_static, and /tf from the first question about a moving frame on.
+
+    /tf carries many messages a second, which would keep a node busy that is never asked.
+    May be asked from any thread but the executor's only one.
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._edges: dict[str, _Edge] = {}
-        self._lock = threading.Lock()
-        self._subscriptions = (
-            node.create_subscription(
-                TFMessage, topics.TF, lambda m: self._add(m, False), QoSProfile(depth=TF_DEPTH)
-            ),
-            node.create_subscription(
-                TFMessage, topics.TF_STATIC, lambda m: self._add(m, True), latched(STATIC_DEPTH)
-            ),
+        self._changed = threading.Condition()
+        self._static = node.create_subscription(
+            TFMessage, topics.TF_STATIC, lambda m: self._add(m, True), latched(STATIC_DEPTH)
         )
+        self._moving: Subscription | None = None
 
     def lookup(self, target: str, origin: str, stamp: int = LATEST) -> se3.Pose:
         """T_target_origin (4, 4) [m] at a stamp [ns].
@@ -87,19 +90,39 @@ class TransformBuffer:
         Raises:
             FrameError: when the frames are not known, not connected, or not at that time.
         """
-        with self._lock:
-            target_chain = dict(self._chain(target.lstrip("/"), stamp))
-            for frame, T_frame_origin in self._chain(origin.lstrip("/"), stamp):
-                if frame in target_chain:
-                    return se3.inverse(target_chain[frame]) @ T_frame_origin
-            parents = {edge.parent for edge in self._edges.values()}
-            known = ", ".join(sorted(parents | set(self._edges))) or "nothing"
-        raise FrameError(f"TF does not connect {origin!r} to {target!r}; it knows {known}")
+        deadline = time.monotonic() + PATIENCE_S
+        with self._changed:
+            while True:
+                try:
+                    return self._connected(target.lstrip("/"), origin.lstrip("/"), stamp)
+                except FrameError:
+                    self._listen()
+                    left_s = deadline - time.monotonic()
+                    if left_s <= 0:
+                        raise
+                    self._changed.wait(left_s)
+
+    def _listen(self) -> None:
+        """Begin to collect /tf."""
+        if self._moving is None:
+            self._moving = self._node.create_subscription(
+                TFMessage, topics.TF, lambda m: self._add(m, False), QoSProfile(depth=TF_DEPTH)
+            )
 
     def close(self) -> None:
         """Stop listening."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
+        self._node.destroy_subscription(self._static)
+        if self._moving is not None:
+            self._node.destroy_subscription(self._moving)
+
+    def _connected(self, target: str, origin: str, stamp: int) -> se3.Pose:
+        target_chain = dict(self._chain(target, stamp))
+        for frame, T_frame_origin in self._chain(origin, stamp):
+            if frame in target_chain:
+                return se3.inverse(target_chain[frame]) @ T_frame_origin
+        parents = {edge.parent for edge in self._edges.values()}
+        known = ", ".join(sorted(parents | set(self._edges))) or "nothing"
+        raise FrameError(f"TF does not connect {origin!r} to {target!r}; it knows {known}")
 
     def _chain(self, frame: str, stamp: int) -> Iterator[tuple[str, se3.Pose]]:
         """A frame and everything above it, with T_above_frame; ends where a time is unknown.
@@ -124,7 +147,7 @@ class TransformBuffer:
             yield frame, T_above_frame
 
     def _add(self, message: TFMessage, static: bool) -> None:
-        with self._lock:
+        with self._changed:
             for transform in message.transforms:
                 child = transform.child_frame_id.lstrip("/")
                 parent = transform.header.frame_id.lstrip("/")
@@ -136,3 +159,4 @@ class TransformBuffer:
                 if edge is None or edge.parent != parent or edge.static != static:
                     edge = self._edges[child] = _Edge(parent, static)
                 edge.add(stamp_ns(transform.header.stamp), pose)
+            self._changed.notify_all()

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from meslam_core.config import MappingConfig
+from meslam_core.field.kernel import KernelField
 from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON
 from meslam_core.field.rendering import render
 from meslam_core.field.sampling import sample_distances
 from meslam_core.mapping.keyframes import KeyframeStore, Rays
 from meslam_core.mapping.losses import RayLosses, ray_losses
 from meslam_core.regions.region import Region
-from meslam_core.se3 import Pose, torch_exp
+from meslam_core.se3 import Pose, inverse, torch_exp
 
 LOSS_MEMORY = 0.8
 # Odometry that disagrees by more than this [m, rad] is taken for a failure and lets go.
@@ -52,6 +54,7 @@ class JointOptimizer:
         self.config = config
         self.device = keyframes.device
         self._generator = torch.Generator(device=self.device).manual_seed(seed)
+        self._seeds = np.random.default_rng(seed)
         self._pose_steps = 0
         self._first_moment = torch.zeros(0, 6, device=self.device)
         self._second_moment = torch.zeros(0, 6, device=self.device)
@@ -97,26 +100,79 @@ class JointOptimizer:
             device=self.device,
         )
         rays = self.keyframes.rays(chosen, slots)
-        rotations = self.keyframes.rotations[chosen]
-        origins = self.keyframes.translations[chosen]
+        with_current = current is not None and T_map_current is not None
+        if with_current and self.config.current_rays:
+            assert current is not None
+            rays = self._with_current(rays, current)
+        else:
+            T_map_current = None
+        if isinstance(region.field, KernelField):
+            losses, gradient = self._compiled_losses(
+                region.field, region, rays, chosen, T_map_current
+            )
+        else:
+            losses, gradient = self._torch_losses(region, rays, chosen, T_map_current, refine_poses)
+        if region.field.step(self.config.learning_rate) and refine_poses:
+            self._move_poses(gradient)
+        self._remember(chosen, losses.sum(dim=1)[: len(chosen)])
+        return losses.mean(dim=0)
+
+    def _torch_losses(
+        self,
+        region: Region,
+        rays: Rays,
+        chosen: torch.Tensor,
+        T_map_current: Pose | None,
+        refine_poses: bool,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Losses (R, 3) and the keyframes' twist gradients (K, 6); the weights keep theirs."""
         twists = torch.zeros(len(self.keyframes), 6, device=self.device, requires_grad=refine_poses)
-        directions = (rotations @ rays.directions[..., None])[..., 0]
+        count = len(chosen)
+        rotations, origins = self.keyframes.rotations[chosen], self.keyframes.translations[chosen]
+        directions = (rotations @ rays.directions[:count, :, None])[..., 0]
         ray_twists = twists[chosen]
         directions = directions + torch.linalg.cross(ray_twists[:, 3:], directions)
         origins = origins + ray_twists[:, :3]
-        if current is not None and T_map_current is not None and self.config.current_rays:
-            rays, origins, directions = self._with_current(
-                rays, origins, directions, current, T_map_current
-            )
+        if T_map_current is not None:
+            pose = torch.from_numpy(T_map_current).float().to(self.device)
+            directions = torch.cat([directions, rays.directions[count:] @ pose[:3, :3].T])
+            origins = torch.cat([origins, pose[:3, 3].expand(len(rays) - count, 3)])
         losses = self._losses(region, rays, origins, directions)
-        torch.autograd.backward(losses.total.mean())
-        if region.field.step(self.config.learning_rate) and refine_poses:
-            assert twists.grad is not None
-            self._move_poses(twists.grad)
-        self._remember(chosen, losses.total.detach()[: len(chosen)])
-        return torch.stack(
-            [part.detach().mean() for part in (losses.distance, losses.depth, losses.color)]
+        losses.total.mean().backward()
+        gradient = twists.grad if twists.grad is not None else torch.zeros_like(twists)
+        parts = [losses.distance, losses.depth, losses.color]
+        return torch.stack(parts, dim=1).detach(), gradient
+
+    def _compiled_losses(
+        self,
+        field: KernelField,
+        region: Region,
+        rays: Rays,
+        chosen: torch.Tensor,
+        T_map_current: Pose | None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same in one pass of the compiled kernel, which draws its own samples."""
+        rotations, translations = self.keyframes.rotations, self.keyframes.translations
+        pose = chosen.numpy()
+        if T_map_current is not None:
+            current = torch.from_numpy(T_map_current).float()
+            rotations = torch.cat([rotations, current[None, :3, :3]])
+            translations = torch.cat([translations, current[None, :3, 3]])
+            added = np.full(len(rays) - len(chosen), len(self.keyframes), np.int64)
+            pose = np.concatenate([pose, added])
+        to_region = inverse(region.T_map_region)[:3] / region.half_side_m
+        losses, gradient = field.train_posed_rays(
+            np.ascontiguousarray(rotations.numpy()),
+            np.ascontiguousarray(translations.numpy()),
+            pose,
+            rays.directions.numpy(),
+            rays.distances_m.numpy(),
+            rays.colors.numpy(),
+            np.ascontiguousarray(to_region, dtype=np.float32),
+            self.config,
+            int(self._seeds.integers(2**31)),
         )
+        return torch.from_numpy(losses), torch.from_numpy(gradient[: len(self.keyframes)].copy())
 
     def _choose_keyframes(self, region: Region) -> torch.Tensor:
         """Keyframe number of each ray: some from the latest, the rest by the root of the loss."""
@@ -128,26 +184,14 @@ class JointOptimizer:
         )
         return torch.cat([members[drawn], members[-1].expand(latest)])
 
-    def _with_current(
-        self,
-        rays: Rays,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        current: Rays,
-        T_map_current: Pose,
-    ) -> tuple[Rays, torch.Tensor, torch.Tensor]:
+    def _with_current(self, rays: Rays, current: Rays) -> Rays:
+        """The rays, followed by some of the current frame."""
         count = self.config.current_rays
         slots = torch.randint(len(current), (count,), generator=self._generator, device=self.device)
-        pose = torch.from_numpy(T_map_current).float().to(self.device)
-        joined = Rays(
+        return Rays(
             torch.cat([rays.directions, current.directions[slots]]),
             torch.cat([rays.distances_m, current.distances_m[slots]]),
             torch.cat([rays.colors, current.colors[slots]]),
-        )
-        return (
-            joined,
-            torch.cat([origins, pose[:3, 3].expand(count, 3)]),
-            torch.cat([directions, current.directions[slots] @ pose[:3, :3].T]),
         )
 
     def _losses(

@@ -60,7 +60,6 @@ NODES_LOG, PLAYER_LOG = "nodes.log", "player.log"
 MESH_RESOLUTION_M = 0.02
 VIEWS = 3
 STARTING_S, FINISHING_S, SERVICE_S, SILENCE_S = 90.0, 120.0, 300.0, 120.0
-ARRIVAL_S = 1.0
 IMAGE_SUBSCRIBERS = 2
 LOG_LINES = 15
 HAS_POSE = (TrackingStatus.OK, TrackingStatus.DEGRADED)
@@ -212,16 +211,13 @@ def _collect(client: MeslamClient, slam: NodeProcess, playing_s: float) -> Live:
     listed: list[ListRegions.Response] = []
 
     def map_is_final() -> bool:
-        if not client.statuses[-1].settled:
+        if not client.settled:
             return False
         listed.append(client.call(ListRegions, topics.LIST_REGIONS, timeout_s=SERVICE_S))
-        if stamp_ns(listed[-1].regions.header.stamp) < last_ns:
-            return False
-        # The last models are under way when tracking has settled; they are a second's matter.
-        time.sleep(ARRIVAL_S)
-        before = [region.version for region in listed[-1].regions.regions]
-        listed.append(client.call(ListRegions, topics.LIST_REGIONS, timeout_s=SERVICE_S))
-        return before == [region.version for region in listed[-1].regions.regions]
+        # The models of a settled map are on their way to the server; two equal answers are final.
+        versions = [[region.version for region in each.regions.regions] for each in listed[-2:]]
+        same = len(versions) == 2 and versions[0] == versions[1]
+        return same and stamp_ns(listed[-1].regions.header.stamp) >= last_ns
 
     _wait(client, slam, map_is_final, FINISHING_S, "the map does not arrive at the map server")
     _wait(client, slam, lambda: client.path_stamp_ns >= last_ns, FINISHING_S, "no final path comes")

@@ -77,7 +77,7 @@ def run_live(
 
             def final() -> bool:
                 listed = client.call(ListRegions, topics.LIST_REGIONS)
-                arrived = stamp_ns(listed.regions.header.stamp) >= last_ns
+                arrived = stamp_ns(listed.regions.header.stamp) >= last_ns and client.settled
                 return arrived and client.path_stamp_ns >= last_ns and client.regions is not None
 
             assert client.spin_until(final, FINAL_S), _logs(nodes)

@@ -28,6 +28,7 @@ FAST = {
     "mapping__first_iterations": 150,
     "mapping__iterations": 8,
     "mapping__keyframe_iterations": 10,
+    "mapping__final_iterations": 20,
     "keyframes__rays": 2048,
     "model_period_s": 0.1,
     "idle_s": 0.3,
@@ -97,7 +98,7 @@ def test_every_frame_gets_a_pose_and_the_map_a_model(start_node, client, reliabi
     refined = client.refined_trajectory(T_BODY_OPTICAL)
     assert len(refined) == len(POSES)
 
-    assert client.spin_until(lambda: bool(models), ANSWER_S)
+    assert client.spin_until(lambda: client.settled and bool(models), ANSWER_S)
     last = models[-1]
     assert last.map_id == statuses[-1].map_id
     assert stored_region(last).index == (0, 0, 0)

@@ -31,7 +31,7 @@ class MeslamClient:
     Attributes:
         node: for further subscriptions.
         poses: T_map_base (4, 4) by stamp [ns], from /meslam/pose.
-        statuses: all of /meslam/status.
+        statuses: of /meslam/status, the latest of every frame.
         path: the latest of /meslam/path.
         regions: the latest of /meslam/regions.
     """
@@ -49,7 +49,7 @@ class MeslamClient:
         self._transforms = StaticTransforms(self.node)
         subscribe = self.node.create_subscription
         subscribe(PoseStamped, topics.POSE, self._take_pose, STREAM)
-        subscribe(TrackingStatus, topics.STATUS, self.statuses.append, STREAM)
+        subscribe(TrackingStatus, topics.STATUS, self._take_status, STREAM)
         subscribe(Path, topics.PATH, lambda m: setattr(self, "path", m), latched())
         subscribe(RegionArray, topics.REGIONS, lambda m: setattr(self, "regions", m), latched())
 
@@ -92,6 +92,11 @@ class MeslamClient:
             self.node.destroy_client(client)
 
     @property
+    def settled(self) -> bool:
+        """Whether the map was refined after the last frame and is published."""
+        return bool(self.statuses) and self.statuses[-1].settled
+
+    @property
     def last_stamp_ns(self) -> int:
         """Stamp of the latest frame that has a status [ns]; 0 before the first."""
         return stamp_ns(self.statuses[-1].header.stamp) if self.statuses else 0
@@ -115,6 +120,13 @@ class MeslamClient:
     def mount(self, base_frame: str, optical_frame: str) -> se3.Pose | None:
         """T_base_camera (4, 4) [m] from /tf_static; None when it does not connect them."""
         return self._transforms.lookup(base_frame, optical_frame)
+
+    def _take_status(self, message: TrackingStatus) -> None:
+        """Keep a status; a frame gets another one when the map has settled after it."""
+        if self.last_stamp_ns == stamp_ns(message.header.stamp):
+            self.statuses[-1] = message
+        else:
+            self.statuses.append(message)
 
     def _take_pose(self, message: PoseStamped) -> None:
         self.poses[stamp_ns(message.header.stamp)] = from_pose(message.pose)

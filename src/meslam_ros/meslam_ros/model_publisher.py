@@ -45,6 +45,7 @@ class ModelPublisher:
         self._waiting: dict[RegionIndex, tuple[str, StoredRegion]] = {}
         self._changed = threading.Condition()
         self._stopping = False
+        self._busy = False
         self._thread = threading.Thread(target=self._run, name="region models", daemon=True)
         self._thread.start()
 
@@ -81,13 +82,18 @@ class ModelPublisher:
                 stored = snapshot(region, stamp_ns)
                 with self._changed:
                     self._waiting[region.index] = self._map_id, stored
-                    self._changed.notify()
+                    self._changed.notify_all()
+
+    def flush(self, timeout_s: float) -> bool:
+        """Wait until everything offered is published; False when that takes longer."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not (self._waiting or self._busy), timeout_s)
 
     def close(self) -> None:
         """Stop; what waits is not published any more."""
         with self._changed:
             self._stopping = True
-            self._changed.notify()
+            self._changed.notify_all()
         self._thread.join()
         self.begin("")
 
@@ -99,6 +105,7 @@ class ModelPublisher:
                     return
                 index = next(iter(self._waiting))
                 map_id, region = self._waiting.pop(index)
+                self._busy = True
             try:
                 message = region_model(region, map_id, self._map_frame, self._precision)
                 self._publish(index, message)
@@ -106,6 +113,9 @@ class ModelPublisher:
                 self._node.get_logger().error(str(error))
             except Exception:
                 self._node.get_logger().fatal(traceback.format_exc())
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
 
     def _publish(self, index: RegionIndex, message: RegionModel) -> None:
         with self._changed:

@@ -41,6 +41,7 @@ from meslam_ros.transforms import CameraMount
 
 # Building a path takes a time that grows with its length; it may take this share of all time.
 PATH_SHARE = 0.03
+FLUSHING_S = 10.0
 LEVELS = {TrackingState.OK: OK, TrackingState.LOST: ERROR}
 
 
@@ -164,7 +165,11 @@ class TrackingNode(ManagedNode):
         assert self._session.result is not None
         self._models.offer(self._session.regions, self._session.result.stamp_ns, final=True)
         self._publish_path()
-        self._publish_status(self._latest_pair)
+        if not self._models.flush(FLUSHING_S):
+            self.get_logger().warn("the last region models are still being encoded")
+        self._latest_status.settled = True
+        self._latest_status.map_bytes = self._models.map_bytes
+        self._status.publish(self._latest_status)
 
     def _odometry_of(self, frame: RgbdFrame, mount: CameraMount) -> OdometryEstimate | None:
         if not self.count_publishers(self._odometry_subscription.topic_name):
@@ -198,7 +203,7 @@ class TrackingNode(ManagedNode):
         status.drop_reasons = counts(dropped)
         status.queue_length = self._worker.waiting
         status.paused = self._paused
-        status.settled = self._all_published
+        self._latest_status = status
         self._status.publish(status)
 
     def _publish_path(self) -> None:

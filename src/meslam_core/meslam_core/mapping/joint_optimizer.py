@@ -138,7 +138,7 @@ class JointOptimizer:
             directions = torch.cat([directions, rays.directions[count:] @ pose[:3, :3].T])
             origins = torch.cat([origins, pose[:3, 3].expand(len(rays) - count, 3)])
         losses = self._losses(region, rays, origins, directions)
-        losses.total.mean().backward()
+        losses.total.mean().backward()  # type: ignore[no-untyped-call]
         gradient = twists.grad if twists.grad is not None else torch.zeros_like(twists)
         parts = [losses.distance, losses.depth, losses.color]
         return torch.stack(parts, dim=1).detach(), gradient

@@ -123,7 +123,7 @@ class MeslamClient:
 
     def _take_status(self, message: TrackingStatus) -> None:
         """Keep a status; a frame gets another one when the map has settled after it."""
-        if self.last_stamp_ns == stamp_ns(message.header.stamp):
+        if self.statuses and self.last_stamp_ns == stamp_ns(message.header.stamp):
             self.statuses[-1] = message
         else:
             self.statuses.append(message)

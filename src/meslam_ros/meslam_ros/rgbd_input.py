@@ -245,6 +245,8 @@ class RgbdInput:
 
     def _likely_cause(self) -> str:
         silent = [s.topic for s in self._subscriptions[:3] if not s.publishers]
+        if len(silent) == 3 and self.pairs:
+            return "the camera or player has ended"
         if len(silent) == 3:
             return "the camera or player is not running, or its topics have other names (remap)"
         if silent:
@@ -257,7 +259,7 @@ class RgbdInput:
                 "colour and depth stamps differ by more than sync_tolerance_s = "
                 f"{self._settings.sync_tolerance_s}"
             )
-        return "the camera or player has paused or ended"
+        return "the camera or player has paused"
 
     def _publishers(self, topic: str) -> list:
         return self._node.get_publishers_info_by_topic(topic)

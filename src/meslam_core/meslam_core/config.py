@@ -284,7 +284,7 @@ class MappingConfig:
     iterations: int = setting(16, "steps a frame", minimum=0, maximum=1000)
     keyframe_iterations: int = setting(40, "steps on a new keyframe", minimum=0, maximum=1000)
     final_iterations: int = setting(
-        1000, "steps after the last frame of a recording", minimum=0, maximum=100000
+        3000, "steps after the last frame of a recording", minimum=0, maximum=100000
     )
     budget_ms: float = setting(
         0.0,

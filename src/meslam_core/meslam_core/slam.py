@@ -31,6 +31,9 @@ MIN_FRAME_PIXELS = 200
 # Below this share of inliers the other first guesses are tried too.
 CONFIDENT_INLIERS = 0.85
 UNTRUSTED_VARIANCE = 0.25
+# A refinement comes in portions of so many steps, the last at this share of the learning rate.
+REFINING_STEPS = 50
+LAST_RATE_FACTOR = 0.05
 FIRST_VARIANCE = 1e-8
 
 
@@ -169,19 +172,31 @@ class Slam:
             mapping_ms=(mapped - tracked) * 1e3,
         )
 
-    def refine(self, steps: int) -> None:
-        """Train on what was seen for `steps` steps, over all regions; keyframe poses follow."""
+    def refine(self, steps: int, progress: float = 0.0) -> None:
+        """Train on what was seen for `steps` steps, over all regions; keyframe poses follow.
+
+        Args:
+            steps: number of Adam steps.
+            progress: share of the whole refinement that is done, in [0, 1]; the learning rate
+                falls with it, and with it the noise that training leaves in the map.
+        """
         if self.atlas is None:
             return
         total = sum(len(region.keyframes) for region in self.atlas.regions.values())
         for region in self.atlas.regions.values():
             share = len(region.keyframes) / max(total, 1)
-            self.optimizer.train(region, max(1, round(steps * share)))
+            self.optimizer.train(
+                region,
+                max(1, round(steps * share)),
+                rate_factor=1.0 + progress * (LAST_RATE_FACTOR - 1.0),
+            )
             region.version += 1
 
     def finish(self) -> None:
         """Refine once more over everything seen; then mark the observed space anew."""
-        self.refine(self.config.mapping.final_iterations)
+        total = self.config.mapping.final_iterations
+        for done in range(0, total, REFINING_STEPS):
+            self.refine(min(REFINING_STEPS, total - done), done / total)
         self.settle()
 
     def settle(self) -> None:

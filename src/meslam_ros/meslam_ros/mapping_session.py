@@ -12,13 +12,11 @@ from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.grid import RegionIndex
 from meslam_core.regions.region import Region
-from meslam_core.slam import FrameResult, Slam, TrackingState
+from meslam_core.slam import REFINING_STEPS, FrameResult, Slam, TrackingState
 from meslam_core.trajectory import Trajectory
 from meslam_ros.odometry_messages import first_base_pose
 from meslam_ros.transforms import CameraMount
 
-# Short enough that the next image does not wait.
-IDLE_STEPS = 20
 WITH_POSE = (TrackingState.OK, TrackingState.DEGRADED)
 
 
@@ -63,11 +61,12 @@ class MappingSession:
 
     def refine(self) -> bool:
         """Refine the map for a moment while no image comes; False when that is done."""
-        if self._slam is None or self._refined_steps >= self._config.mapping.final_iterations:
+        total = self._config.mapping.final_iterations
+        if self._slam is None or self._refined_steps >= total:
             return False
-        self._slam.refine(IDLE_STEPS)
-        self._refined_steps += IDLE_STEPS
-        if self._refined_steps >= self._config.mapping.final_iterations:
+        self._slam.refine(REFINING_STEPS, self._refined_steps / total)
+        self._refined_steps += REFINING_STEPS
+        if self._refined_steps >= total:
             self._slam.settle()
         return True
 

@@ -66,6 +66,7 @@ class JointOptimizer:
         current: Rays | None = None,
         T_map_current: Pose | None = None,
         refine_poses: bool = True,
+        rate_factor: float = 1.0,
     ) -> StepLosses:
         """Run `steps` steps on a region and return their mean losses.
 
@@ -75,11 +76,12 @@ class JointOptimizer:
             current: rays of the current frame to mix in, with their pose.
             T_map_current: (4, 4) pose of the current frame, held fixed.
             refine_poses: whether keyframe poses move.
+            rate_factor: of the weights' learning rate.
         """
         sums = torch.zeros(3, device=self.device)
         done = 0
         for _ in range(steps):
-            losses = self._step(region, current, T_map_current, refine_poses)
+            losses = self._step(region, current, T_map_current, refine_poses, rate_factor)
             sums += losses
             done += 1
         means = (sums / max(done, 1)).tolist()
@@ -91,6 +93,7 @@ class JointOptimizer:
         current: Rays | None,
         T_map_current: Pose | None,
         refine_poses: bool,
+        rate_factor: float,
     ) -> torch.Tensor:
         chosen = self._choose_keyframes(region)
         slots = torch.randint(
@@ -112,7 +115,7 @@ class JointOptimizer:
             )
         else:
             losses, gradient = self._torch_losses(region, rays, chosen, T_map_current, refine_poses)
-        if region.field.step(self.config.learning_rate) and refine_poses:
+        if region.field.step(self.config.learning_rate * rate_factor) and refine_poses:
             self._move_poses(gradient)
         self._remember(chosen, losses.sum(dim=1)[: len(chosen)])
         return losses.mean(dim=0)

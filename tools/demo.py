@@ -73,7 +73,7 @@ def main() -> int:
     except TrackingLostError as error:
         console.print(f"[bold red]demo failed:[/] {error}", highlight=False)
         return 3
-    except MeslamError as error:
+    except (MeslamError, TimeoutError) as error:
         console.print(f"[bold red]demo failed:[/] {error}", highlight=False)
         return 2
     except KeyboardInterrupt:

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import os
-from itertools import islice
-from pathlib import Path
-
 import numpy as np
 import open3d as o3d
 import pytest
 from data import ros_domain
 from data.live_system import LiveRun, run_live
-from data.memory_recording import MemoryRecording
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.evaluation.reconstruction import observed_surface, surface_error
 from meslam_core.evaluation.trajectory_error import absolute_error
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.store import MapStore
-from meslam_core.recordings import convert, open_recording
+from meslam_core.recordings import convert
 from meslam_core.simulation.simulator import Simulation, simulate
-from meslam_core.trajectory import read_tum
 from meslam_interfaces.msg import Region, TrackingStatus
 from meslam_interfaces.srv import QueryOccupancy
 from meslam_ros import topics
@@ -31,7 +25,6 @@ ros_domain.enter()
 
 CAMERA = PinholeCamera(320, 240, 307.5, 307.5, 159.5, 119.5)
 DURATION_S = 4.0
-REAL_FRAMES = 60
 ANSWERED: dict[str, np.ndarray] = {}
 POINTS = np.random.default_rng(0).uniform([0, -1.5, -1], [3, 1.5, 1], (4000, 3)).astype("f4")
 
@@ -107,31 +100,3 @@ def test_saved_map_answers_as_the_server_did(live: LiveRun) -> None:
     occupancy, _ = NeuralMap(loaded.regions).occupancy(POINTS)
     np.testing.assert_array_equal(occupancy, ANSWERED["occupancy"])
     assert {-1, 0, 100} == set(np.unique(occupancy))
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> tuple[LiveRun, Path]:
-    """Two seconds of a real recording, as mcap."""
-    data = os.environ.get("MESLAM_DATA")
-    if not data:
-        pytest.skip("MESLAM_DATA names no folder of real recordings")
-    source = Path(data, "tum_fr1_xyz")
-    if not source.is_dir():
-        pytest.skip(f"{source} is not there")
-    folder = tmp_path_factory.mktemp("desk")
-    recording = folder / "desk.mcap"
-    convert(MemoryRecording(list(islice(open_recording(source).frames(), REAL_FRAMES))), recording)
-    return run_live(recording, folder, resolution_m=0.04), source / "groundtruth.txt"
-
-
-def test_real_recording_is_tracked(desk: tuple[LiveRun, Path]) -> None:
-    live, truth = desk
-    assert len(live.online) >= 0.98 * REAL_FRAMES
-    assert absolute_error(live.online, read_tum(truth)).rmse_m < 0.04
-
-
-def test_real_mesh_has_surface_and_colour(desk: tuple[LiveRun, Path]) -> None:
-    live, _ = desk
-    mesh = o3d.io.read_triangle_mesh(live.export.path)
-    assert 3.0 < mesh.get_surface_area() < 60.0
-    assert np.ptp(np.asarray(mesh.vertex_colors), axis=0).min() > 0.3

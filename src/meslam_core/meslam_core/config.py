@@ -281,10 +281,10 @@ class MappingConfig:
         0.04, "spread of the samples near the surface", unit="m", minimum=0.005, maximum=0.5
     )
     first_iterations: int = setting(300, "steps on the first frame", minimum=1, maximum=10000)
-    iterations: int = setting(16, "steps a frame", minimum=0, maximum=1000)
-    keyframe_iterations: int = setting(40, "steps on a new keyframe", minimum=0, maximum=1000)
+    iterations: int = setting(24, "steps a frame", minimum=0, maximum=1000)
+    keyframe_iterations: int = setting(60, "steps on a new keyframe", minimum=0, maximum=1000)
     final_iterations: int = setting(
-        3000, "steps after the last frame of a recording", minimum=0, maximum=100000
+        4000, "steps after the last frame of a recording", minimum=0, maximum=100000
     )
     budget_ms: float = setting(
         0.0,

@@ -31,6 +31,8 @@ MIN_FRAME_PIXELS = 200
 # Below this share of inliers the other first guesses are tried too.
 CONFIDENT_INLIERS = 0.85
 UNTRUSTED_VARIANCE = 0.25
+# Odometry is carried over at most so many frames that have none.
+MAX_ODOMETRY_GAP = 10
 # A refinement comes in portions of so many steps, the last at this share of the learning rate.
 REFINING_STEPS = 50
 LAST_RATE_FACTOR = 0.05
@@ -211,9 +213,7 @@ class Slam:
         """T_map_camera of every tracked frame as it is known now."""
         return Trajectory(
             self._stamps(),
-            np.array(
-                [self.keyframes.pose(f.keyframe) @ f.T_keyframe_camera for f in self._frames]
-            ).reshape(-1, 4, 4),
+            np.array([self._current_pose(f) for f in self._frames]).reshape(-1, 4, 4),
         )
 
     def online_trajectory(self) -> Trajectory:
@@ -277,18 +277,25 @@ class Slam:
         best = max(alignments, key=lambda alignment: alignment.inlier_ratio)
         return best, self._judge(best, odometry)
 
-    def _motion(self, odometry: OdometryEstimate | None) -> Pose | None:
-        """Odometry's motion (4, 4) since the last frame; None where it is not valid."""
-        last = self._frames[-1].odometry
-        if odometry is None or last is None or not odometry.valid:
+    def _moved(self, odometry: OdometryEstimate | None) -> tuple[Pose, Pose] | None:
+        """Pose of the last frame that has odometry, and odometry's motion since, both (4, 4).
+
+        None where there is no valid odometry to go by.
+        """
+        if odometry is None or not odometry.valid:
             return None
-        return inverse(last.T_odom_camera) @ odometry.T_odom_camera
+        for frame in reversed(self._frames[-MAX_ODOMETRY_GAP:]):
+            if frame.odometry is not None:
+                motion = inverse(frame.odometry.T_odom_camera) @ odometry.T_odom_camera
+                return self._current_pose(frame), motion
+        return None
 
     def _prior(self, odometry: OdometryEstimate | None) -> PosePrior | None:
         """The last pose moved by odometry, as certain as both are."""
-        motion = self._motion(odometry)
-        if motion is None:
+        moved = self._moved(odometry)
+        if moved is None:
             return None
+        T_map_last, motion = moved
         limits = self.config.tracking
         distance = float(np.linalg.norm(motion[:3, 3]))
         sigma_m = limits.odometry_sigma_m + limits.odometry_drift * distance
@@ -296,30 +303,32 @@ class Slam:
         sigma_rad += limits.odometry_drift * rotation_angle(motion)
         variances = np.repeat([sigma_m**2, sigma_rad**2], 3)
         covariance = self._covariance + np.diag(variances)
-        mean = orthonormalized(self._latest_pose() @ motion)
+        mean = orthonormalized(T_map_last @ motion)
         return PosePrior(mean, inverted(covariance))
 
     def _guesses(self, stamp_ns: int, odometry: OdometryEstimate | None) -> list[Pose]:
         """First guesses of a pose: odometry since the last frame, constant velocity, standstill."""
         guesses = []
-        motion = self._motion(odometry)
-        if motion is not None:
-            guesses.append(self._latest_pose() @ motion)
+        moved = self._moved(odometry)
+        if moved is not None:
+            guesses.append(moved[0] @ moved[1])
         guesses.append(self._extrapolated(stamp_ns))
         guesses.append(self._latest_pose())
         return [orthonormalized(guess) for guess in guesses]
 
+    def _current_pose(self, frame: _TrackedFrame) -> Pose:
+        """A frame's pose through its keyframe, which may have moved since."""
+        return self.keyframes.pose(frame.keyframe) @ frame.T_keyframe_camera
+
     def _latest_pose(self) -> Pose:
-        """The last frame's pose through its keyframe, which may have moved since."""
-        last = self._frames[-1]
-        return self.keyframes.pose(last.keyframe) @ last.T_keyframe_camera
+        return self._current_pose(self._frames[-1])
 
     def _extrapolated(self, stamp_ns: int) -> Pose:
         latest = self._latest_pose()
         if len(self._frames) < 2:
             return latest
         before, last = self._frames[-2], self._frames[-1]
-        T_map_before = self.keyframes.pose(before.keyframe) @ before.T_keyframe_camera
+        T_map_before = self._current_pose(before)
         elapsed = max(last.stamp_ns - before.stamp_ns, 1)
         ahead = min((stamp_ns - last.stamp_ns) / elapsed, 3.0)
         return latest @ exp(ahead * log(orthonormalized(inverse(T_map_before) @ latest)))

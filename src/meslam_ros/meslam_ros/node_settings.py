@@ -64,7 +64,7 @@ class TrackingSettings:
     """Parameters of the tracking node alone."""
 
     odometry_timeout_s: float = setting(
-        0.5,
+        2.0,
         "how long an image pair waits for its odometry before it is tracked without",
         unit="s",
         minimum=0.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -112,6 +113,11 @@ class Slam:
         seed: of every random choice; the same frames and seed give the same result.
         T_map_camera: (4, 4) pose of the first frame; by default the first camera defines the
             map frame, x forward and z up.
+
+    Attributes:
+        state: of tracking.
+        effort: share of the configured mapping steps that a frame gets, in (0, 1]; a live system
+            lowers it when it falls behind the camera.
     """
 
     def __init__(
@@ -125,6 +131,7 @@ class Slam:
         self.policy = KeyframePolicy(config.keyframes, config.field)
         self.atlas: RegionAtlas | None = None
         self.state = TrackingState.INITIALISING
+        self.effort = 1.0
         self._seed = seed
         self._generator = np.random.default_rng(seed)
         self._T_map_first = T_map_camera
@@ -394,7 +401,8 @@ class Slam:
             self._add_keyframe(frame, pixels, pose, odometry)
         current = self._sample(frame, pixels, CURRENT_FRAME_RAYS)
         mapping = self.config.mapping
-        steps = mapping.keyframe_iterations if is_keyframe else mapping.iterations
+        wanted = mapping.keyframe_iterations if is_keyframe else mapping.iterations
+        steps = math.ceil(wanted * self.effort)
         losses = self.optimizer.train(region, steps, current, pose)
         region.version += 1
         for neighbor in self.atlas.training:

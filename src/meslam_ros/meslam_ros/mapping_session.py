@@ -47,14 +47,26 @@ class MappingSession:
         self._refined_steps = 0
 
     def process(
-        self, frame: RgbdFrame, mount: CameraMount, odometry: OdometryEstimate | None
+        self,
+        frame: RgbdFrame,
+        mount: CameraMount,
+        odometry: OdometryEstimate | None,
+        effort: float = 1.0,
     ) -> FrameResult:
-        """Track and map one frame."""
+        """Track and map one frame.
+
+        Args:
+            frame: the next one.
+            mount: of the camera on the base.
+            odometry: of the frame, where there is one.
+            effort: share of the configured mapping steps to take, in (0, 1].
+        """
         if self._slam is None:
             T_map_camera = first_base_pose(mount) @ mount.T_base_optical
             self._slam, self._mount = Slam(self._config, self._seed, T_map_camera), mount
         self.received += 1
         self._refined_steps = 0
+        self._slam.effort = effort
         self.result = self._slam.process(frame, odometry)
         self.tracked += self.has_pose
         return self.result

@@ -70,6 +70,9 @@ class TrackingSettings:
         minimum=0.0,
         maximum=10.0,
     )
+    adapt_effort: bool = setting(
+        True, "take fewer mapping steps a frame while image pairs queue up, down to a tenth"
+    )
     transform_rate_hz: float = setting(
         20.0,
         "how often the transform from map to odometry is sent again",

@@ -19,6 +19,7 @@ from meslam_core.slam import TrackingState
 from meslam_interfaces.msg import RegionIndex, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
+from meslam_ros.effort import MappingEffort
 from meslam_ros.frame_worker import WARNING_PERIOD_S, FrameWorker
 from meslam_ros.image_synchronizer import ImagePair
 from meslam_ros.managed_node import ManagedNode, run
@@ -103,6 +104,7 @@ class TrackingNode(ManagedNode):
         """Start with an empty map."""
         self._session = MappingSession(self._config, self._settings.seed)
         self._reset_requested = False
+        self._effort = MappingEffort()
         self._all_published = True
         self._path_due_s = 0.0
         self._models.begin(self._session.map_id)
@@ -123,7 +125,8 @@ class TrackingNode(ManagedNode):
             self.refuse(pair, "paused")
             return
         odometry = self._odometry_of(frame, mount)
-        result = session.process(frame, mount, odometry)
+        effort = self._effort.update(self._worker.waiting) if self._settings.adapt_effort else 1.0
+        result = session.process(frame, mount, odometry, effort)
         head = header(frame.stamp_ns, self._frames.map_frame)
         if session.has_pose:
             T_map_base = result.T_map_camera @ session.T_camera_base

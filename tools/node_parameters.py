@@ -20,6 +20,7 @@ IMAGE_NODES = "odometry, tracking"
 NODES = {
     node_settings.FrameSettings: f"{IMAGE_NODES}; `map_frame` all",
     node_settings.InputSettings: IMAGE_NODES,
+    node_settings.OdometrySettings: "odometry",
     node_settings.TrackingSettings: "tracking",
     node_settings.RegionManagerSettings: "region manager",
     node_settings.MapServerSettings: "map server",

@@ -35,7 +35,7 @@ class Listener:
 
 
 def test_motion_twist_and_transform_follow_the_camera(start_node, client) -> None:
-    start_node(OdometryNode)
+    start_node(OdometryNode, odometry_queue_size=30)
     listener, driver = Listener(client), CameraDriver(client.node)
     assert client.spin_until(driver.has_subscribers, WAIT_S)
     stamps = [driver.send(frame) for frame in FRAMES]
@@ -58,7 +58,7 @@ def test_motion_twist_and_transform_follow_the_camera(start_node, client) -> Non
 
 def test_frame_with_a_parent_gets_no_second_one(start_node, client) -> None:
     """On a robot whose description mounts camera_link, its root moves in odom instead."""
-    start_node(OdometryNode)
+    start_node(OdometryNode, odometry_queue_size=30)
     listener, driver = Listener(client), CameraDriver(client.node)
     T_base_link = exp(np.array([0.1, 0.0, 0.5, 0.0, 0.0, 0.3]))
     kept = StaticBroadcaster(client.node, T_base_link, "base_link", "camera_link")
@@ -75,7 +75,7 @@ def test_frame_with_a_parent_gets_no_second_one(start_node, client) -> None:
 
 
 def test_odometry_begins_anew_when_the_recording_does(start_node, client, capfd) -> None:
-    start_node(OdometryNode)
+    start_node(OdometryNode, odometry_queue_size=30)
     listener, driver = Listener(client), CameraDriver(client.node)
     assert client.spin_until(driver.has_subscribers, WAIT_S)
     for frame in (*FRAMES[:3], FRAMES[0]):

@@ -19,6 +19,7 @@ SECTIONS = list(MeslamConfig().to_mapping())
 KINDS = [
     node_settings.FrameSettings,
     node_settings.InputSettings,
+    node_settings.OdometrySettings,
     node_settings.TrackingSettings,
     node_settings.RegionManagerSettings,
     node_settings.MapServerSettings,
@@ -102,7 +103,7 @@ def test_unusable_values_are_refused_by_name(
 
 def test_values_cannot_be_changed_behind_the_nodes_back(node_with) -> None:
     node = node_with()
-    declare_settings(node, node_settings.InputSettings)
+    declare_settings(node, node_settings.TrackingSettings)
     (result,) = node.set_parameters([Parameter("queue_size", value=3)])
     assert not result.successful
     assert "read-only" in result.reason or "read only" in result.reason

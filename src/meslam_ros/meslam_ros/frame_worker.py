@@ -45,6 +45,7 @@ class FrameWorker:
     Args:
         node: whose executor listens; stopped when the consumer fails.
         settings, frames: of the input.
+        queue_size: image pairs that may wait.
         consumer: of the frames.
     """
 
@@ -53,11 +54,12 @@ class FrameWorker:
         node: ManagedNode,
         settings: InputSettings,
         frames: FrameSettings,
+        queue_size: int,
         consumer: FrameConsumer,
     ) -> None:
         self._node = node
         self._consumer = consumer
-        self._queue: FrameQueue[ImagePair] = FrameQueue(settings.queue_size)
+        self._queue: FrameQueue[ImagePair] = FrameQueue(queue_size)
         self._last_stamp_ns: int | None = None
         self._stopping = threading.Event()
         self._warned_dropping_s = 0.0

@@ -13,7 +13,7 @@ from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.store import MapStore
 from meslam_core.map.stored_region import StoredRegion
 from meslam_core.regions.grid import RegionGrid, RegionIndex
-from meslam_interfaces.msg import RegionModel
+from meslam_interfaces.msg import RegionArray, RegionModel
 from meslam_ros.region_catalog import RegionCatalog, RegionEntry
 from meslam_ros.region_messages import region_model, stored_region
 
@@ -44,7 +44,7 @@ class MapModels:
     """
 
     def __init__(self, config: MeslamConfig, map_frame: str) -> None:
-        self.catalog = RegionCatalog()
+        self._catalog = RegionCatalog()
         self._config = config
         self._map_frame = map_frame
         self._regions: dict[RegionIndex, StoredRegion] = {}
@@ -64,13 +64,13 @@ class MapModels:
             MapError: when the model is damaged, of another format, or contradicts itself.
         """
         with self._lock:
-            if model.map_id == self._replaced_map_id or not self.catalog.is_news(model):
+            if model.map_id == self._replaced_map_id or not self._catalog.is_news(model):
                 return False
             region = stored_region(model)
             self._live_map_id = model.map_id
-            if model.map_id != self.catalog.map_id:
+            if model.map_id != self._catalog.map_id:
                 self._begin(model.map_id)
-            self.catalog.add(RegionEntry.of(model))
+            self._catalog.add(RegionEntry.of(model))
             self._regions[region.index] = region
             self._data[region.index] = bytes(model.data)
             self._snapshot = None
@@ -86,8 +86,8 @@ class MapModels:
             if self._snapshot is None:
                 regions = dict(self._regions)
                 self._snapshot = MapSnapshot(
-                    map_id=self.catalog.map_id,
-                    stamp_ns=self.catalog.newest_stamp_ns,
+                    map_id=self._catalog.map_id,
+                    stamp_ns=self._catalog.newest_stamp_ns,
                     versions={index: region.version for index, region in regions.items()},
                     map=NeuralMap(regions.values(), self._config.map, self._config.field.backend),
                 )
@@ -96,7 +96,18 @@ class MapModels:
     def entries(self) -> list[RegionEntry]:
         """What is known of the regions, in the order of their creation."""
         with self._lock:
-            return list(self.catalog.entries.values())
+            return list(self._catalog.entries.values())
+
+    def message(self, overlap: float) -> RegionArray:
+        """The catalogue of regions as a message."""
+        with self._lock:
+            return self._catalog.message(self._map_frame, overlap)
+
+    @property
+    def map_id(self) -> str:
+        """Identity of the map; empty as long as there is none."""
+        with self._lock:
+            return self._catalog.map_id
 
     def save(self, path: Path) -> int:
         """Write the map to a store; returns the number of regions.
@@ -105,7 +116,7 @@ class MapModels:
             OutputError: when the folder cannot be written.
         """
         with self._lock:
-            data, grid, map_id = list(self._data.values()), self._grid(), self.catalog.map_id
+            data, grid, map_id = list(self._data.values()), self._grid(), self._catalog.map_id
         MapStore(path).save(data, grid, map_id)
         return len(data)
 
@@ -126,13 +137,13 @@ class MapModels:
             self._begin(loaded.map_id)
             self._replaced_map_id = self._live_map_id if self._live_map_id != loaded.map_id else ""
             for region, model in zip(loaded.regions, models, strict=True):
-                self.catalog.add(RegionEntry.of(model))
+                self._catalog.add(RegionEntry.of(model))
                 self._regions[region.index] = region
                 self._data[region.index] = bytes(model.data)
         return loaded.warnings
 
     def _begin(self, map_id: str) -> None:
-        self.catalog.begin(map_id)
+        self._catalog.begin(map_id)
         self._regions.clear()
         self._data.clear()
         self._snapshot = None

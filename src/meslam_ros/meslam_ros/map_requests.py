@@ -197,7 +197,7 @@ class MapRequests:
         with _exclusive(self._storing, "another map is being saved or loaded"):
             response.quarantined = self._models.load(path)
         response.path = str(path)
-        response.map_id = self._models.catalog.map_id
+        response.map_id = self._models.map_id
         response.regions = len(self._models.entries())
         response.message = f"{response.regions} regions read from {path}"
         if response.quarantined:
@@ -205,7 +205,7 @@ class MapRequests:
 
     def list_regions(self, _: ListRegions.Request, response: ListRegions.Response) -> None:
         """The catalogue of regions; an empty map has an empty one."""
-        response.regions = self._models.catalog.message(self._map_frame, self._overlap)
+        response.regions = self._models.message(self._overlap)
         response.message = f"{len(response.regions.regions)} regions"
 
     def _snapshot(self) -> MapSnapshot:

@@ -44,12 +44,6 @@ class InputSettings:
         minimum=0.0,
         maximum=1.0,
     )
-    queue_size: int = setting(
-        30,
-        "image pairs that may wait for processing; beyond, the oldest is dropped and counted",
-        minimum=1,
-        maximum=1000,
-    )
     input_timeout_s: float = setting(
         3.0,
         "without images for this long, the node says what it waits for",
@@ -60,9 +54,28 @@ class InputSettings:
 
 
 @dataclass(frozen=True)
+class OdometrySettings:
+    """Parameters of the odometry node alone."""
+
+    odometry_queue_size: int = setting(
+        3,
+        "image pairs that may wait for odometry; few, for odometry that comes late is of no use: "
+        "tracking interpolates between what comes in time",
+        minimum=1,
+        maximum=1000,
+    )
+
+
+@dataclass(frozen=True)
 class TrackingSettings:
     """Parameters of the tracking node alone."""
 
+    queue_size: int = setting(
+        30,
+        "image pairs that may wait for tracking; beyond, the oldest is dropped and counted",
+        minimum=1,
+        maximum=1000,
+    )
     odometry_timeout_s: float = setting(
         2.0,
         "how long an image pair waits for its odometry before it is tracked without",

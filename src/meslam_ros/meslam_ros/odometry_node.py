@@ -17,7 +17,7 @@ from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN,
 from meslam_ros.frame_worker import WARNING_PERIOD_S, FrameWorker
 from meslam_ros.image_synchronizer import ImagePair
 from meslam_ros.managed_node import ManagedNode, run
-from meslam_ros.node_settings import FrameSettings, InputSettings
+from meslam_ros.node_settings import FrameSettings, InputSettings, OdometrySettings
 from meslam_ros.odometry_messages import BaseMotion
 from meslam_ros.parameters import declare_config, declare_settings
 from meslam_ros.qos import STREAM
@@ -32,6 +32,7 @@ class OdometryNode(ManagedNode):
         super().__init__("odometry_node", **options)
         self._frames = declare_settings(self, FrameSettings)
         self._inputs = declare_settings(self, InputSettings)
+        self._settings = declare_settings(self, OdometrySettings)
         self._config = declare_config(self, ("sensor", "odometry", "runtime"))
         torch.set_num_threads(self._config.runtime.threads)
 
@@ -42,7 +43,9 @@ class OdometryNode(ManagedNode):
 
     def activate(self) -> None:
         self._begin()
-        self._worker = FrameWorker(self, self._inputs, self._frames, self)
+        self._worker = FrameWorker(
+            self, self._inputs, self._frames, self._settings.odometry_queue_size, self
+        )
         self._timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
 
     def deactivate(self) -> None:

@@ -83,7 +83,9 @@ class TrackingNode(ManagedNode):
         self._begin()
 
     def activate(self) -> None:
-        self._worker = FrameWorker(self, self._inputs, self._frames, self)
+        self._worker = FrameWorker(
+            self, self._inputs, self._frames, self._settings.queue_size, self
+        )
         self._timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
 
     def deactivate(self) -> None:

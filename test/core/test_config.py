@@ -104,7 +104,10 @@ def test_outdated_files_are_named(tmp_path, capsys):
     assert config_reference.main(["--root", str(tmp_path)]) == 0
     assert config_reference.main(["--root", str(tmp_path), "--check"]) == 0
     file = tmp_path / "config" / "meslam.yaml"
-    file.write_text(file.read_text().replace("rays: 200", "rays: 201"))
+    rays = MeslamConfig().mapping.rays
+    outdated = file.read_text().replace(f"rays: {rays}", f"rays: {rays + 1}")
+    assert outdated != file.read_text()
+    file.write_text(outdated)
     assert config_reference.main(["--root", str(tmp_path), "--check"]) == 1
     assert "config/meslam.yaml is out of date" in capsys.readouterr().err
 

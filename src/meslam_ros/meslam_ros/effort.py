@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-# Fewer pairs than this wait also when all goes well.
-USUAL_QUEUE = 2
+# So many pairs wait also when all goes well.
+USUAL_QUEUE = 1
 LESS = 0.8
 MORE = 1.05
 LEAST = 0.1

@@ -10,7 +10,7 @@ RUN apt-get update \
 
 WORKDIR /meslam
 COPY . .
-RUN make setup && rm -rf /root/.cache /var/lib/apt/lists/*
+RUN make setup && rm -rf "$HOME/.cache" /var/lib/apt/lists/*
 
 ENTRYPOINT ["/bin/bash", "-c", "source /meslam/env.bash && exec \"$@\"", "meslam"]
 CMD ["ros2", "run", "meslam_ros", "slam_node"]

@@ -286,13 +286,6 @@ class MappingConfig:
     final_iterations: int = setting(
         4000, "steps after the last frame of a recording", minimum=0, maximum=100000
     )
-    budget_ms: float = setting(
-        0.0,
-        "mapping time a frame, 0 for no limit; the number of steps adapts",
-        unit="ms",
-        minimum=0.0,
-        maximum=10000.0,
-    )
     learning_rate: float = setting(4e-3, "Adam's step for the weights", minimum=1e-6, maximum=0.1)
     pose_learning_rate: float = setting(
         2e-3, "Adam's step for keyframe poses", unit="m, rad", minimum=0.0, maximum=0.1

@@ -94,7 +94,8 @@ def test_four_nodes_start_restart_and_end_together(start, client) -> None:
         return now.get("region_manager_node", 0) not in (0, first["region_manager_node"])
 
     assert wait_until(restarted, STARTING_S)
-    assert "region_manager_node crashed" in slam.output()
+    # Said only once the new process runs, which may already have been seen.
+    assert wait_until(lambda: "region_manager_node crashed" in slam.output(), STARTING_S)
 
     last = children(slam.pid)
     assert {n: p for n, p in last.items() if n != "region_manager_node"} == {

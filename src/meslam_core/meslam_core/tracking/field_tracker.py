@@ -15,13 +15,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from meslam_core.config import TrackingConfig
+from meslam_core.field.alignment import AlignmentSettings, NormalEquations
 from meslam_core.field.model import LUMA
 from meslam_core.field.rendering import surface_level
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, exp, inverse, orthonormalized
+from meslam_core.tracking.field_equations import field_equations
+
+Floats = NDArray[np.float32]
 
 SATURATION = 0.95
+# A flatter f [1/m] tells nothing of where the surface is.
+MIN_SLOPE = 1.0
 # Limits of the believed noise of a point's distance to the surface [m].
 MIN_SPREAD_M = 0.003
 MAX_SPREAD_M = 0.05
@@ -71,15 +77,42 @@ class PosePrior:
 
 
 @dataclass(frozen=True)
-class _Residuals:
-    """Distances [m], their pose derivatives, and the same for colour; one row a point."""
+class _Measured:
+    """What a frame measured, as every step needs it; one row a point.
 
-    distance: NDArray[np.float64]
-    distance_jacobian: NDArray[np.float64]
-    luma: NDArray[np.float64]
-    luma_jacobian: NDArray[np.float64]
-    usable: NDArray[np.bool_]
-    observed: NDArray[np.bool_]
+    Attributes:
+        ends: (N, 3) float32, camera frame [m].
+        luma: (N,) float32.
+        confidence: (N,) float32, from the depth camera's noise.
+    """
+
+    ends: Floats
+    luma: Floats
+    confidence: Floats
+
+    @classmethod
+    def of(cls, rays: Rays) -> _Measured:
+        depth = rays.distances_m.numpy()
+        return cls(
+            ends=rays.directions.numpy() * depth[:, None],
+            luma=rays.colors.numpy() @ np.array(LUMA, np.float32),
+            confidence=np.minimum(1.5, 1.0 / (0.5 + 0.125 * depth**2)).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A frame's points against the field at one pose.
+
+    Attributes:
+        equations: weighted by confidence and robustly.
+        observed: number of points in space that was observed.
+        errors_m: absolute distances to the surface [m] of the points that can be used.
+    """
+
+    equations: NormalEquations
+    observed: int
+    errors_m: Floats
 
 
 class FieldTracker:
@@ -99,15 +132,16 @@ class FieldTracker:
             T_map_camera: (4, 4) first guess.
             prior: keeps the pose where geometry leaves it free, and smooth.
         """
+        measured = _Measured.of(rays)
         pose = T_map_camera.copy()
         converged = False
         iteration = 0
         information = np.zeros((6, 6))
         for iteration in range(1, self.config.iterations + 1):
-            residuals = self._residuals(region, rays, pose)
-            if np.count_nonzero(residuals.usable) < MIN_POINTS:
+            fit = self._fit(region, measured, pose, self._huber(iteration))
+            if len(fit.errors_m) < MIN_POINTS:
                 break
-            information, step = self._solve(rays, residuals, self._huber(iteration), pose, prior)
+            information, step = self._solve(fit, pose, prior)
             if not np.isfinite(step).all():
                 break
             motion = exp(np.concatenate([np.zeros(3), step[3:]]))
@@ -117,26 +151,24 @@ class FieldTracker:
                 converged = True
                 break
         pose = orthonormalized(pose)
-        residuals = self._residuals(region, rays, pose)
-        distance = np.abs(residuals.distance[residuals.usable])
-        inliers = int(np.count_nonzero(distance < self.config.inlier_distance_m))
-        observed = int(np.count_nonzero(residuals.observed))
+        fit = self._fit(region, measured, pose)
+        inliers = int(np.count_nonzero(fit.errors_m < self.config.inlier_distance_m))
         return Alignment(
             T_map_camera=pose,
             information=information,
-            residual_m=float(np.median(distance)) if len(distance) else float("inf"),
-            inlier_ratio=inliers / max(observed, 1),
-            observed_ratio=observed / max(len(rays), 1),
+            residual_m=float(np.median(fit.errors_m)) if len(fit.errors_m) else float("inf"),
+            inlier_ratio=inliers / max(fit.observed, 1),
+            observed_ratio=fit.observed / max(len(rays), 1),
             iterations=iteration,
             converged=converged,
         )
 
     def robust_cost(self, region: Region, rays: Rays, T_map_camera: Pose) -> float:
         """Mean Geman-McClure cost in [0, 1] of a pose; compares first guesses."""
-        residuals = self._residuals(region, rays, T_map_camera)
-        squared = (residuals.distance / self.config.huber_narrow_m) ** 2
-        cost = np.where(residuals.usable, squared / (1.0 + squared), 1.0)
-        return float(np.mean(cost))
+        errors = self._fit(region, _Measured.of(rays), T_map_camera).errors_m
+        squared = (errors / self.config.huber_narrow_m) ** 2
+        unusable = len(rays) - len(errors)
+        return float((np.sum(squared / (1.0 + squared)) + unusable) / max(len(rays), 1))
 
     def _huber(self, iteration: int) -> float:
         """The robust threshold narrows geometrically over the first four steps."""
@@ -144,59 +176,44 @@ class FieldTracker:
         wide, narrow = self.config.huber_wide_m, self.config.huber_narrow_m
         return float(wide * (narrow / wide) ** progress)
 
-    def _residuals(self, region: Region, rays: Rays, pose: Pose) -> _Residuals:
-        arms = (rays.directions.numpy() * rays.distances_m.numpy()[:, None]) @ pose[:3, :3].T
+    def _fit(
+        self, region: Region, measured: _Measured, pose: Pose, huber_m: float | None = None
+    ) -> _Fit:
+        """Compare points with the field; without a robust threshold only their distances count."""
         T_region_map = inverse(region.T_map_region)
-        points = (arms + pose[:3, 3]) @ T_region_map[:3, :3].T + T_region_map[:3, 3]
-        values, field_gradient, field_luma_gradient = region.field.probe(
-            np.ascontiguousarray(points / region.half_side_m, dtype=np.float32)
-        )
-        to_map = T_region_map[:3, :3] / region.half_side_m
-        gradient = field_gradient.astype(np.float64) @ to_map
-        luma_gradient = field_luma_gradient.astype(np.float64) @ to_map
-        slope = np.linalg.norm(gradient, axis=1)
+        # Composed before it meets the points: far from the map's origin single precision is coarse.
+        T_region_camera = (T_region_map @ pose).astype(np.float32)
+        points = measured.ends @ T_region_camera[:3, :3].T + T_region_camera[:3, 3]
         # What the network says of space that nobody saw means nothing, and neither does its
         # gradient where it is saturated, far from any surface.
         observed = region.mask.lookup(points) > 0
-        usable = observed & (np.abs(values[:, 0]) < SATURATION) & (slope > 1.0)
-        slope = np.maximum(slope, 1e-6)
-        distance = (values[:, 0] - surface_level(region.field.config)) / slope
-        normal = gradient / slope[:, None]
-        luma = values[:, 1:] @ np.array(LUMA) - rays.colors.numpy() @ np.array(LUMA)
-        return _Residuals(
-            distance=distance,
-            distance_jacobian=np.concatenate([normal, np.cross(arms, normal)], axis=1),
-            luma=luma,
-            luma_jacobian=np.concatenate([luma_gradient, np.cross(arms, luma_gradient)], axis=1),
-            usable=usable,
-            observed=observed,
+        equations = field_equations(
+            region.field,
+            points / np.float32(region.half_side_m),
+            measured.ends @ pose[:3, :3].T.astype(np.float32),
+            measured.luma,
+            measured.confidence * observed,
+            AlignmentSettings(
+                to_map=T_region_map[:3, :3] / region.half_side_m,
+                surface_level=surface_level(region.field.config),
+                saturation=SATURATION,
+                min_slope=MIN_SLOPE,
+                huber_m=self.config.huber_narrow_m if huber_m is None else huber_m,
+                color_weight=0.0 if huber_m is None else self.config.color_weight,
+            ),
         )
+        errors = np.abs(equations.distance_m[equations.usable])
+        return _Fit(equations, int(np.count_nonzero(observed)), errors)
 
     def _solve(
-        self,
-        rays: Rays,
-        residuals: _Residuals,
-        huber_m: float,
-        pose: Pose,
-        prior: PosePrior | None,
+        self, fit: _Fit, pose: Pose, prior: PosePrior | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Information (6, 6) and step (6,) of one iteratively reweighted step."""
-        depth = rays.distances_m.numpy()
-        confidence = np.minimum(1.5, 1.0 / (0.5 + 0.125 * depth**2)) * residuals.usable
-        weight = confidence * _huber_weight(residuals.distance, huber_m)
-        jacobian = residuals.distance_jacobian
-        information = (jacobian * weight[:, None]).T @ jacobian
-        gradient = jacobian.T @ (weight * residuals.distance)
-        if self.config.color_weight > 0.0:
-            scale = self.config.color_weight
-            weight = confidence * _huber_weight(scale * residuals.luma, huber_m) * scale**2
-            jacobian = residuals.luma_jacobian
-            information = information + (jacobian * weight[:, None]).T @ jacobian
-            gradient = gradient + jacobian.T @ (weight * residuals.luma)
         # Neighbouring points err alike, in the depth image as in the map.
-        sigma = _spread(residuals.distance[residuals.usable])
+        sigma = _spread(fit.errors_m)
         scale = 1.0 / (sigma**2 * self.config.points_per_observation)
-        information, gradient = information * scale, gradient * scale
+        information = fit.equations.information * scale
+        gradient = fit.equations.gradient * scale
         if prior is not None:
             information = information + prior.information
             gradient = gradient + prior.information @ prior.deviation(pose)
@@ -205,10 +222,6 @@ class FieldTracker:
         return information, step
 
 
-def _huber_weight(residual: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
-    return np.minimum(1.0, threshold / np.maximum(np.abs(residual), 1e-12))
-
-
-def _spread(distance: NDArray[np.float64]) -> float:
+def _spread(errors_m: Floats) -> float:
     """Standard deviation [m] of residuals, from their median so that outliers do not count."""
-    return float(np.clip(1.4826 * np.median(np.abs(distance)), MIN_SPREAD_M, MAX_SPREAD_M))
+    return float(np.clip(1.4826 * np.median(errors_m), MIN_SPREAD_M, MAX_SPREAD_M))

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
 import torch
 from data.textured_room import path
 
+from meslam_core.field.model import TorchField
+from meslam_core.mapping import joint_optimizer
 from meslam_core.mapping.joint_optimizer import JointOptimizer
-from meslam_core.mapping.keyframes import Rays
+from meslam_core.mapping.keyframes import Rays, rays_at
 from meslam_core.se3 import exp, inverse, log
+from meslam_core.tracking.pixels import trusted_pixels
 
 ERROR = exp(np.array([0.015, -0.02, 0.01, 0.01, -0.008, 0.012]))
 """A keyframe pose that is wrong by 2.7 cm and 1 degree."""
@@ -99,16 +103,73 @@ def test_the_current_frame_is_learnt_too(build_room):
     assert np.median(values[1]) < -0.3
 
 
-def test_rays_come_mostly_from_keyframes_that_fit_badly(room):
+def test_torch_and_the_kernel_learn_alike(build_room):
+    """The same steps in two implementations, with other random samples along the rays."""
+    losses = []
+    for backend in ("kernel", "torch"):
+        room = build_room(0, (f"field.backend={backend}",))
+        optimizer = JointOptimizer(room.keyframes, room.config.mapping)
+        pose = room.poses[5]
+        frame = room.frame(5)
+        rows, columns = np.nonzero(trusted_pixels(frame.depth_m, room.config.sensor))
+        current = rays_at(frame, rows[::7], columns[::7])
+        optimizer.train(room.region, 60, current, pose)
+        losses.append(optimizer.train(room.region, 20, current, pose))
+    assert losses[0].total == pytest.approx(losses[1].total, rel=0.15)
+    assert losses[0].color == pytest.approx(losses[1].color, rel=0.15)
+
+
+def test_torch_and_the_kernel_pull_a_wrong_pose_alike(room):
+    room.keyframes.set_pose(2, ERROR @ room.poses[room.mapped[2]])
+    reference = TorchField(room.config.field)
+    reference.load_flat(room.region.field.flat())
     optimizer = JointOptimizer(room.keyframes, room.config.mapping)
-    room.keyframes.losses[:] = 0.01
-    room.keyframes.losses[1] = 1.0
-    chosen = torch.cat([optimizer._choose_keyframes(room.region) for _ in range(20)])
-    shares = torch.bincount(chosen, minlength=5) / len(chosen)
-    latest = room.config.mapping.latest_share
-    # Square roots of the losses: 10 against four times 1.
-    assert shares[1].item() == pytest.approx((1 - latest) * 10 / 14, abs=0.03)
-    assert shares[4].item() == pytest.approx(latest + (1 - latest) / 14, abs=0.03)
+    draws = optimizer._draw(room.region, 6, None)
+    rotations, translations = room.keyframes.pose_arrays()
+    sums = []
+    for network in (room.region.field, reference):
+        region = dataclasses.replace(room.region, field=network)
+        batches = optimizer._batches(region, draws, None, refine_poses=True)
+        steps = [batches.train(step, rotations, translations) for step in range(6)]
+        sums.append((np.sum([s[0] for s in steps], axis=0), np.sum([s[1] for s in steps], axis=0)))
+    np.testing.assert_allclose(sums[0][0].mean(axis=0), sums[1][0].mean(axis=0), rtol=0.15)
+    one, other = sums[0][1][2], sums[1][1][2]
+    assert one @ other > 0.9 * np.linalg.norm(one) * np.linalg.norm(other)
+
+
+def test_keyframes_of_other_regions_stand_still(room):
+    room.region.keyframes.remove(1)
+    room.region.keyframes.remove(3)
+    for number in range(4):
+        room.keyframes.add_link(number, number + 1, ERROR)
+    before = [room.keyframes.pose(number) for number in range(5)]
+    JointOptimizer(room.keyframes, room.config.mapping).train(room.region, 10)
+    for number in (0, 1, 3):
+        np.testing.assert_array_equal(room.keyframes.pose(number), before[number])
+    for number in (2, 4):
+        assert np.abs(room.keyframes.pose(number) - before[number]).max() > 1e-4
+
+
+def test_what_fits_badly_is_remembered(room):
+    room.keyframes.set_pose(2, ERROR @ room.poses[room.mapped[2]])
+    room.keyframes.losses[:] = 1.0
+    JointOptimizer(room.keyframes, room.config.mapping).train(
+        room.region, 30, refine_poses=False, rate_factor=1e-6
+    )
+    losses = room.keyframes.losses
+    assert losses.argmax().item() == 2
+    assert (losses < 0.8).all()
+
+
+def test_a_portion_of_steps_or_several_learn_alike(build_room, monkeypatch):
+    totals = []
+    for portion in (64, 5):
+        monkeypatch.setattr(joint_optimizer, "STEPS_AT_ONCE", portion)
+        room = build_room(0)
+        optimizer = JointOptimizer(room.keyframes, room.config.mapping)
+        optimizer.train(room.region, 60)
+        totals.append(optimizer.train(room.region, 17).total)
+    assert totals[0] == pytest.approx(totals[1], rel=0.15)
 
 
 def test_a_step_whose_gradient_is_not_finite_changes_nothing(room):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from data.textured_room import frame_at, path
 
@@ -57,6 +58,18 @@ def test_a_batch_gathers_rays_of_many_keyframes():
     torch.testing.assert_close(rays.distances_m, torch.tensor([407.0, 19.0, 200.0]))
 
 
+def test_arrays_hold_the_same_rays_for_indices_of_any_shape():
+    store = KeyframeStore(20, CPU)
+    for number in range(5):
+        store.add(number, np.eye(4), numbered_rays(20, number))
+    keyframes, slots = np.array([[4, 0], [2, 2]]), np.array([[7, 19], [0, 3]])
+    directions, distances, colors = store.ray_arrays(keyframes, slots)
+    rays = store.rays(torch.from_numpy(keyframes), torch.from_numpy(slots))
+    np.testing.assert_array_equal(directions, rays.directions)
+    np.testing.assert_array_equal(distances, [[407.0, 19.0], [200.0, 203.0]])
+    np.testing.assert_array_equal(colors[0], [[7, 7, 7], [19, 19, 19]])
+
+
 def test_a_keyframe_with_few_rays_repeats_them():
     store = KeyframeStore(20, CPU)
     store.add(0, np.eye(4), numbered_rays(6, 0))
@@ -83,3 +96,32 @@ def test_a_new_keyframe_is_sampled_as_often_as_the_worst_known():
     store.losses[1] = 7.0
     newest = store.add(3, np.eye(4), numbered_rays(4, 3))
     assert store.losses[newest].item() == 7.0
+
+
+def test_a_keyframe_is_linked_to_its_predecessor_and_to_any_other():
+    store = KeyframeStore(4, CPU)
+    for number in range(3):
+        store.add(number, np.eye(4), numbered_rays(4, number), np.eye(4) if number == 2 else None)
+    assert len(store.links) == 1
+    store.add_link(0, 2, np.eye(4), 0.5)
+    assert len(store.links) == 2
+
+
+@pytest.mark.parametrize(
+    ("link", "error"),
+    [
+        ((0, 3, np.eye(4)), IndexError),
+        ((-1, 1, np.eye(4)), IndexError),
+        ((1, 1, np.eye(4)), ValueError),
+        ((0, 1, np.full((4, 4), np.nan)), ValueError),
+        ((0, 1, np.eye(4), -1.0), ValueError),
+        ((0, 1, np.eye(4), float("inf")), ValueError),
+    ],
+)
+def test_links_that_mean_nothing_are_refused(link, error):
+    store = KeyframeStore(4, CPU)
+    for number in range(3):
+        store.add(number, np.eye(4), numbered_rays(4, number))
+    with pytest.raises(error, match="link"):
+        store.add_link(*link)
+    assert len(store.links) == 0

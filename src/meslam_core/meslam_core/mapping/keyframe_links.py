@@ -11,9 +11,9 @@ Floats = NDArray[np.float32]
 
 # A measurement that disagrees by more than this [m, rad] is taken for a failure and lets go.
 LINK_OUTLIER = 0.03
-_NEXT, _AFTER_NEXT = [1, 2, 0], [2, 0, 1]
+_NEXT, _AFTER_NEXT = np.array([1, 2, 0]), np.array([2, 0, 1])
 # Where a flattened matrix holds the entries of hat(w) that are w, and those that are -w.
-HAT_POSITIVE, HAT_NEGATIVE = [7, 2, 3], [5, 6, 1]
+HAT_POSITIVE, HAT_NEGATIVE = np.array([7, 2, 3]), np.array([5, 6, 1])
 
 
 class KeyframeLinks:
@@ -99,6 +99,7 @@ class LinkBlock:
         self.rotations = rotations
         self.translations = translations
         self.weights = weights
+        self._first, self._second = np.ascontiguousarray(ends.T)
         # Every step sums over the links of each pose: their order and where each pose's begin.
         both = ends.T.reshape(-1)
         order = np.argsort(both, kind="stable")
@@ -118,28 +119,28 @@ class LinkBlock:
         """
         if not len(self._order):
             return
-        first, second = self.ends[:, 0], self.ends[:, 1]
-        from_first = rotations[first]
+        from_first = rotations.take(self._first, axis=0)
         arms = (from_first @ self.translations[:, :, None])[:, :, 0]
-        moved = translations[second] - translations[first] - arms
-        turned = rotations[second] @ (from_first @ self.rotations).transpose(0, 2, 1)
+        turned = from_first @ self.rotations
+        turned = rotations.take(self._second, axis=0) @ turned.transpose(0, 2, 1)
         turned = turned.reshape(-1, 9)
-        turned = np.float32(0.5) * (turned[:, HAT_POSITIVE] - turned[:, HAT_NEGATIVE])
-        weights = np.float32(weight) * self.weights
-        moved *= (weights * _outlier_weight(moved))[:, None]
-        turned *= (weights * _outlier_weight(turned))[:, None]
-        parts = np.empty((2, len(moved), 6), np.float32)
-        parts[1, :, :3] = moved
-        parts[1, :, 3:] = turned
+        # Shift and turn of each link's second end against where its first end would have it.
+        errors = np.empty((len(arms), 2, 3), np.float32)
+        moved = errors[:, 0]
+        np.subtract(translations.take(self._second, axis=0), arms, out=moved)
+        moved -= translations.take(self._first, axis=0)
+        np.subtract(turned.take(HAT_POSITIVE, 1), turned.take(HAT_NEGATIVE, 1), out=errors[:, 1])
+        errors[:, 1] *= np.float32(0.5)
+        squared = (errors * errors).sum(axis=2)
+        squared *= np.float32(1.0 / LINK_OUTLIER**2)
+        squared += np.float32(1.0)
+        # Geman-McClure.
+        errors *= (np.float32(weight) * self.weights[:, None] / (squared * squared))[:, :, None]
+        parts = np.empty((2, len(arms), 6), np.float32)
+        parts[1] = errors.reshape(-1, 6)
         np.negative(parts[1], out=parts[0])
-        parts[0, :, 3:] -= arms[:, _NEXT] * moved[:, _AFTER_NEXT]
-        parts[0, :, 3:] += arms[:, _AFTER_NEXT] * moved[:, _NEXT]
-        sums = np.add.reduceat(parts.reshape(-1, 6)[self._order], self._starts, axis=0)
+        lever = arms.take(_NEXT, 1) * moved.take(_AFTER_NEXT, 1)
+        lever -= arms.take(_AFTER_NEXT, 1) * moved.take(_NEXT, 1)
+        parts[0, :, 3:] -= lever
+        sums = np.add.reduceat(parts.reshape(-1, 6).take(self._order, axis=0), self._starts)
         gradient[self._poses] += sums
-
-
-def _outlier_weight(error: Floats) -> Floats:
-    """Geman-McClure weights (L,) of errors (L, 3)."""
-    squared = np.einsum("ij,ij->i", error, error)
-    weight: Floats = (1.0 + squared / np.float32(LINK_OUTLIER**2)) ** -2
-    return weight

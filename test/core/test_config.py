@@ -47,7 +47,7 @@ def test_a_whole_number_serves_for_a_measure():
         ("mapping.rays=many", "'many' is str, expected int"),
         ("mapping.rays=10.5", "10.5 is float, expected int"),
         ("mapping.rays=true", "True is bool, expected int"),
-        ("odometry.method=visual", "choose one of hybrid, colored_icp"),
+        ("odometry.method=visual", "choose one of direct, hybrid, colored_icp"),
         ("sensor.max_depth_m=.nan", "outside"),
         ("sensor.max_depth_m=", "NoneType, expected float"),
         ("sensor.max_depth_m=[1, 2]", "list, expected float"),

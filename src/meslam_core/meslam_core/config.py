@@ -106,10 +106,11 @@ class OdometryConfig:
     """Frame-to-keyframe odometry (Sec. II-A)."""
 
     method: str = setting(
-        "hybrid",
-        "'hybrid': RGB-D odometry with photometric and geometric terms; "
+        "direct",
+        "'direct': compiled alignment with photometric and geometric terms; "
+        "'hybrid': Open3D's RGB-D odometry with both; "
         "'colored_icp': coloured point-cloud registration as in the paper",
-        choices=("hybrid", "colored_icp"),
+        choices=("direct", "hybrid", "colored_icp"),
     )
     image_width: int = setting(
         320, "images are reduced to at most this width", unit="px", minimum=80, maximum=1920
@@ -119,6 +120,16 @@ class OdometryConfig:
     )
     max_distance_m: float = setting(
         0.07, "correspondences farther apart are outliers", unit="m", minimum=0.005, maximum=1.0
+    )
+    luma_bias_m: float = setting(
+        0.005,
+        "what the images alone may tell wrong: colour and depth differ in time",
+        unit="m",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    luma_bias_deg: float = setting(
+        0.25, "the same of the rotation", unit="deg", minimum=0.0, maximum=90.0
     )
     keyframe_translation_m: float = setting(
         0.15, "a new odometry keyframe after this motion", unit="m", minimum=0.01, maximum=2.0

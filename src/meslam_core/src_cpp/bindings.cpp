@@ -153,6 +153,7 @@ PYBIND11_MODULE(_kernel, module) {
              py::arg("beta2") = 0.99f, py::arg("epsilon") = 1e-8f,
              py::arg("encoding_scale") = 1.0f);
     bind_rays(module, field);
+    bind_rgbd(module);
 }
 
 }  // namespace meslam

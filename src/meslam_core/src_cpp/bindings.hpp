@@ -59,6 +59,9 @@ inline Array new_matrix(size_t rows, py::ssize_t columns) {
     return Array({static_cast<py::ssize_t>(rows), columns});
 }
 
+// Adds the alignment of RGB-D images.
+void bind_rgbd(py::module_& module);
+
 // Adds the training on rays and the alignment of frames.
 void bind_rays(py::module_& module, py::class_<FusedField>& field);
 

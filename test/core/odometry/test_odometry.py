@@ -15,7 +15,7 @@ from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import Odometry, make_odometry
 from meslam_core.se3 import Pose, exp, inverse, log
 
-METHODS = ["hybrid", "colored_icp"]
+METHODS = ["direct", "hybrid", "colored_icp"]
 CAMERA = SMALL_CAMERA.scaled(2.0)
 POSES = path(9, step_m=0.012, step_deg=0.8)
 
@@ -48,7 +48,9 @@ def distance_and_angle(pose: Pose, true: Pose) -> tuple[float, float]:
     return float(np.linalg.norm(twist[:3])), float(np.rad2deg(np.linalg.norm(twist[3:])))
 
 
-@pytest.mark.parametrize(("method", "tolerance_m"), [("hybrid", 0.007), ("colored_icp", 0.015)])
+@pytest.mark.parametrize(
+    ("method", "tolerance_m"), [("direct", 0.007), ("hybrid", 0.007), ("colored_icp", 0.015)]
+)
 def test_a_known_motion_is_found(method, tolerance_m):
     follower = odometry(method)
     estimates = [follower.process(view(number)) for number in range(9)]
@@ -141,7 +143,7 @@ def test_an_unrelated_view_is_not_believed(method):
 
 
 def test_motion_beyond_the_limits_is_not_believed():
-    follower = odometry("hybrid", "odometry.max_speed_m_s=0.1")
+    follower = odometry("direct", "odometry.max_speed_m_s=0.1")
     poses = path(2, step_m=0.03)
     follower.process(frame_at(poses[0], 0))
     estimate = follower.process(frame_at(poses[1], 1))
@@ -151,7 +153,7 @@ def test_motion_beyond_the_limits_is_not_believed():
 
 def test_drift_stays_small_while_a_keyframe_serves():
     """Registering against a keyframe does not add up errors from frame to frame."""
-    follower = odometry("hybrid")
+    follower = odometry("direct")
     for time, number in enumerate([0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0]):
         estimate = follower.process(replace(view(number), stamp_ns=time * PERIOD_NS))
     distance, angle = distance_and_angle(estimate.T_odom_camera, np.eye(4))
@@ -161,7 +163,7 @@ def test_drift_stays_small_while_a_keyframe_serves():
 
 def test_large_images_are_reduced():
     large = CAMERA.scaled(2.0)
-    follower = odometry("hybrid")
+    follower = odometry("direct")
     poses = path(2)
     for number, pose in enumerate(poses):
         estimate = follower.process(frame_at(pose, number, large))

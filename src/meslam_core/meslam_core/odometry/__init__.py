@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import logging
+
 from meslam_core.config import OdometryConfig, SensorConfig
+from meslam_core.odometry import direct
+from meslam_core.odometry.direct import DirectRegistrar
 from meslam_core.odometry.keyframe_odometry import KeyframeOdometry
 from meslam_core.odometry.odometry import Odometry, OdometryEstimate
 from meslam_core.odometry.registration import ColoredIcpRegistrar, HybridRegistrar, Registrar
 
 __all__ = ["Odometry", "OdometryEstimate", "make_odometry"]
 
+logger = logging.getLogger(__name__)
+
 
 def make_odometry(odometry: OdometryConfig, sensor: SensorConfig) -> Odometry:
     """The odometry that the configuration names."""
-    registrar: Registrar = HybridRegistrar(odometry, sensor)
+    return KeyframeOdometry(_registrar(odometry, sensor), odometry, sensor)
+
+
+def _registrar(odometry: OdometryConfig, sensor: SensorConfig) -> Registrar:
     if odometry.method == "colored_icp":
-        registrar = ColoredIcpRegistrar(odometry, sensor)
-    return KeyframeOdometry(registrar, odometry, sensor)
+        return ColoredIcpRegistrar(odometry, sensor)
+    if odometry.method == "hybrid":
+        return HybridRegistrar(odometry, sensor)
+    reason = direct.unavailable_reason()
+    if reason:
+        logger.warning("odometry.method = direct: %s; using Open3D's hybrid method", reason)
+        return HybridRegistrar(odometry, sensor)
+    return DirectRegistrar(odometry, sensor)

@@ -22,7 +22,6 @@ from meslam_core.se3 import Pose, exp, inverse, log, orthonormalized, rotation_a
 logger = logging.getLogger(__name__)
 
 UNKNOWN_VARIANCE = 1.0
-INDEPENDENT_CORRESPONDENCES = 10.0
 NANOSECONDS = 1e-9
 
 
@@ -138,17 +137,9 @@ class KeyframeOdometry:
 
 
 def _covariance(registration: Registration, valid: bool) -> NDArray[np.float64]:
-    """Covariance (6, 6), translation first, of a registration.
-
-    Correspondences err together (of texture, of occlusion, of the sensor), so that thousands of
-    them tell hardly more than a few independent ones.
-    """
+    """Covariance (6, 6), translation first, of a registration."""
     if not valid:
         return np.eye(6) * UNKNOWN_VARIANCE
-    order = [3, 4, 5, 0, 1, 2]
-    information = registration.information[np.ix_(order, order)]
-    correspondences = max(np.trace(information[:3, :3]) / 3.0, 1.0)
-    information = information * (INDEPENDENT_CORRESPONDENCES / correspondences)
-    variance = np.clip(registration.residual_m, 1e-3, 1.0) ** 2
-    covariance: NDArray[np.float64] = np.linalg.inv(information + 1e-3 * np.eye(6)) * variance
+    information = registration.information + np.eye(6) / UNKNOWN_VARIANCE
+    covariance: NDArray[np.float64] = np.linalg.inv(information)
     return covariance

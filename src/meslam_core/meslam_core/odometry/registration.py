@@ -1,4 +1,4 @@
-"""The two registrations: coloured point clouds (the paper's) and hybrid RGB-D odometry."""
+"""Open3D's registrations: coloured point clouds (the paper's) and hybrid RGB-D odometry."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ COLORED_ITERATIONS = 50
 NORMAL_NEIGHBORS = 20
 DEPTH_HUBER_M = 0.05
 RESIDUAL_STRIDE = 16
+INDEPENDENT_CORRESPONDENCES = 10.0
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Registration:
 
     Attributes:
         T_target_source: (4, 4).
-        information: (6, 6) of (rotation, translation), Open3D's order.
+        information: (6, 6) of (translation [m], rotation [rad]) about the target's origin,
+            target axes.
         fitness: share of points with a correspondence.
         residual_m: RMS distance of the correspondences [m].
     """
@@ -148,7 +150,9 @@ class HybridRegistrar:
         fitness = min(1.0, result.fitness / max(source.measured_share, 1e-3))
         transformation = result.transformation.numpy()
         residual_m = depth_residual_m(source, target, transformation, limit)
-        return Registration(transformation, information.numpy(), fitness, residual_m)
+        return Registration(
+            transformation, _scaled(information.numpy(), residual_m), fitness, residual_m
+        )
 
     def _hybrid(
         self,
@@ -170,6 +174,22 @@ class HybridRegistrar:
             odometry.Method.Hybrid,
             odometry.OdometryLossParams(limit_m, min(DEPTH_HUBER_M, limit_m)),
         )
+
+
+def _scaled(information: NDArray[np.float64], residual_m: float) -> NDArray[np.float64]:
+    """Open3D's information (6, 6), of rotation first and for residuals of 1 m, as a pose's.
+
+    Correspondences err together (of texture, of occlusion, of the sensor), so that thousands of
+    them tell hardly more than a few independent ones.
+    """
+    order = [3, 4, 5, 0, 1, 2]
+    information = information[np.ix_(order, order)]
+    correspondences = max(np.trace(information[:3, :3]) / 3.0, 1.0)
+    variance = np.clip(residual_m, 1e-3, 1.0) ** 2
+    scaled: NDArray[np.float64] = information * (
+        INDEPENDENT_CORRESPONDENCES / (correspondences * variance)
+    )
+    return scaled
 
 
 def depth_residual_m(
@@ -234,7 +254,7 @@ class ColoredIcpRegistrar:
         )
         return Registration(
             np.array(result.transformation),
-            np.array(information),
+            _scaled(np.array(information), result.inlier_rmse),
             result.fitness,
             result.inlier_rmse,
         )

@@ -149,6 +149,12 @@ class OdometryConfig:
         minimum=0.0,
         maximum=1.0,
     )
+    min_agreement: float = setting(
+        0.35,
+        "share of points that match in depth and colour below which a result is invalid",
+        minimum=0.0,
+        maximum=1.0,
+    )
     max_speed_m_s: float = setting(
         3.0, "faster motion is not believed", unit="m/s", minimum=0.1, maximum=50.0
     )

@@ -25,6 +25,8 @@ constexpr int kUnknowns = 8;
 constexpr int kProducts = kUnknowns * (kUnknowns + 1) / 2;
 constexpr float kFreedom = 5.0f;
 constexpr float kFirstLumaSigma = 0.05f;
+// Luma differences below this are noise.
+constexpr float kSameLight = 0.08f;
 constexpr float kMinLumaSigma = 0.004f;
 constexpr float kMinDepthScale = 0.25f;
 // Keeps gain and offset where the image has no contrast to tell them.
@@ -43,9 +45,9 @@ struct System {
 
 struct Sums {
     System luma, depth;
-    double luma_squares, luma_weight, luma_count;
-    double depth_squares, depth_weight, depth_count;
-    double in_view, visible, inliers, squared_distance;
+    double luma_squares, luma_weight;
+    double depth_squares, depth_weight;
+    double in_view, same_light, visible, inliers, squared_distance;
 };
 
 struct Motion {
@@ -130,7 +132,7 @@ void accumulate(const RgbdLevel& source, const RgbdLevel& target, const Motion& 
             ++kept;
         }
         float luma_squares = 0.0f, luma_weights = 0.0f, depth_squares = 0.0f, depth_weights = 0.0f;
-        float depth_count = 0.0f, inliers = 0.0f, visible = 0.0f, squared_distance = 0.0f;
+        float same_light = 0.0f, inliers = 0.0f, visible = 0.0f, squared_distance = 0.0f;
         for (int n = 0; n < kept; ++n) {
             const float* const texel = looked_up[n];
             const float inverse = 1.0f / z[n];
@@ -146,6 +148,7 @@ void accumulate(const RgbdLevel& source, const RgbdLevel& target, const Motion& 
             const float scaled = difference / scales.luma;
             const float luma_weight = lit ? (kFreedom + 1.0f) / (kFreedom + scaled * scaled) : 0.0f;
             luma_squares += luma_weight * difference * difference;
+            same_light += std::fabs(difference) < kSameLight ? 1.0f : 0.0f;
             luma_weights += lit ? 1.0f : 0.0f;
             const float root = std::sqrt(luma_weight) / scales.luma;
             const float gx = root * texel[1] * camera.fx * inverse;
@@ -171,7 +174,6 @@ void accumulate(const RgbdLevel& source, const RgbdLevel& target, const Motion& 
                 near ? (kFreedom + 1.0f) / (kFreedom + whitened * whitened) : 0.0f;
             depth_squares += depth_weight * distance * distance;
             depth_weights += near ? 1.0f : 0.0f;
-            depth_count += near ? 1.0f : 0.0f;
             const float scale = near ? std::sqrt(depth_weight) / (scales.depth * noise) : 0.0f;
             const float nx = scale * normal[0], ny = scale * normal[1], nz = scale * normal[2];
             rows.depth[0][n] = nx;
@@ -192,8 +194,8 @@ void accumulate(const RgbdLevel& source, const RgbdLevel& target, const Motion& 
         sums.luma_weight += luma_weights;
         sums.depth_squares += depth_squares;
         sums.depth_weight += depth_weights;
-        sums.depth_count += depth_count;
         sums.in_view += kept;
+        sums.same_light += same_light;
         sums.inliers += inliers;
         sums.visible += visible;
         sums.squared_distance += squared_distance;
@@ -371,9 +373,10 @@ RgbdAlignment align_rgbd(const RgbdPyramid& source, const RgbdPyramid& target, c
     Scales scales{kFirstLumaSigma, 1.0f, 1.0f, 0.0f, 0.0f};
     const size_t shared = std::min(source.levels().size(), target.levels().size());
     const int last = static_cast<int>(std::min<size_t>(settings.levels, shared)) - 1;
+    const int finest = std::min(settings.finest, last);
     Sums sums{};
     Equations equations;
-    for (int number = last; number >= 0; --number) {
+    for (int number = last; number >= finest; --number) {
         const RgbdLevel& from = source.levels()[number];
         const RgbdLevel& to = target.levels()[number];
         scales.max_distance = settings.max_distance * (1.0f + 0.5f * number);
@@ -419,8 +422,9 @@ RgbdAlignment align_rgbd(const RgbdPyramid& source, const RgbdPyramid& target, c
     result.inliers = sums.inliers;
     result.visible = sums.visible;
     result.in_view = sums.in_view;
+    result.same_light = sums.same_light;
     result.squared_distance = sums.squared_distance;
-    result.points = static_cast<double>(source.levels().front().z.size());
+    result.points = static_cast<double>(source.levels()[finest].z.size());
     result.luma_sigma = scales.luma;
     result.depth_scale = scales.depth;
     return result;

@@ -41,7 +41,8 @@ private:
 };
 
 struct RgbdAlignmentSettings {
-    int levels;          // used, from the finest on
+    int finest;          // the level that is aligned last; 0 is the pyramid's first
+    int levels;          // of the pyramid that may be used
     int iterations;      // at most, a level
     float max_distance;  // of corresponding depths [m]; grows by half with every level
     float convergence;   // a step below this [m, rad] ends the finest level, twice it the next, ...
@@ -58,6 +59,7 @@ struct RgbdAlignment {
     double inliers;           // points whose depth agrees
     double visible;           // points that fall on measured depth
     double in_view;           // points that fall into the image
+    double same_light;        // of those, points of the luma seen there
     double points;            // of the source level
     double squared_distance;  // sum over the inliers [m^2]
     double luma_sigma;        // scale of the luma residuals at the end

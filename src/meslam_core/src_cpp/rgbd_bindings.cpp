@@ -38,16 +38,16 @@ RgbdPyramid* new_pyramid(const py::array& gray, const py::array& depth, float mi
 
 py::dict align(const RgbdPyramid& source, const RgbdPyramid& target,
                const py::array_t<double, py::array::c_style | py::array::forcecast>& pose,
-               int levels, int iterations, float max_distance, float convergence, float correlated,
-               float luma_bias_m, float luma_bias_rad) {
+               int finest, int levels, int iterations, float max_distance, float convergence,
+               float correlated, float luma_bias_m, float luma_bias_rad) {
     if (pose.ndim() != 2 || pose.shape(0) != 4 || pose.shape(1) != 4) {
         throw py::value_error("T_target_source has shape " + describe_shape(pose) +
                               "; (4, 4) is expected");
     }
-    if (levels < 1 || iterations < 1 || !(correlated >= 1.0f)) {
-        throw py::value_error("levels, iterations and correlated must be at least 1");
+    if (finest < 0 || levels < 1 || iterations < 1 || !(correlated >= 1.0f)) {
+        throw py::value_error("finest must not be negative; levels, iterations and correlated must be at least 1");
     }
-    const RgbdAlignmentSettings settings{levels,      iterations,  max_distance, convergence,
+    const RgbdAlignmentSettings settings{finest,      levels,      iterations,  max_distance, convergence,
                                          correlated, luma_bias_m, luma_bias_rad};
     const double* const guess = pose.data();
     RgbdAlignment found;
@@ -65,6 +65,7 @@ py::dict align(const RgbdPyramid& source, const RgbdPyramid& target,
     result["inliers"] = found.inliers;
     result["visible"] = found.visible;
     result["in_view"] = found.in_view;
+    result["same_light"] = found.same_light;
     result["points"] = found.points;
     result["squared_distance"] = found.squared_distance;
     result["luma_sigma"] = found.luma_sigma;
@@ -84,8 +85,8 @@ void bind_rgbd(py::module_& module) {
                                [](const RgbdPyramid& pyramid) { return pyramid.levels().size(); })
         .def_property_readonly("measured", &RgbdPyramid::measured);
     module.def("align_rgbd", align, py::arg("source"), py::arg("target"),
-               py::arg("T_target_source"), py::kw_only(), py::arg("levels"),
-               py::arg("iterations"), py::arg("max_distance"), py::arg("convergence"),
+               py::arg("T_target_source"), py::kw_only(), py::arg("finest"),
+               py::arg("levels"), py::arg("iterations"), py::arg("max_distance"), py::arg("convergence"),
                py::arg("correlated"), py::arg("luma_bias_m"), py::arg("luma_bias_rad"));
 }
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,9 @@ from meslam_core.se3 import Pose, exp, inverse, log, orthonormalized, rotation_a
 logger = logging.getLogger(__name__)
 
 UNKNOWN_VARIANCE = 1.0
+# Within such a motion between two frames the alignment finds the right answer from any guess.
+SAFE_MOTION_M = 0.04
+SAFE_TURN_RAD = 0.05
 NANOSECONDS = 1e-9
 
 
@@ -81,20 +85,38 @@ class KeyframeOdometry:
         )
 
     def _register(self, prepared: Any, guess: Pose, elapsed_s: float) -> tuple[Registration, str]:
-        """Register against the keyframe, harder where that fits badly; why a result is invalid."""
+        """Register against the keyframe, harder where that is doubtful; why it is invalid."""
         best = self._attempt(prepared, self._keyframe, self._T_odom_keyframe, guess, wide=False)
-        if best.fitness < self._config.good_fitness:
-            attempts = [
-                (self._keyframe, self._T_odom_keyframe, guess),
-                (self._previous, self._T_odom_last, guess),
-                (self._previous, self._T_odom_last, self._T_odom_last),
-            ]
-            for target, T_odom_target, start in attempts:
-                retried = self._attempt(prepared, target, T_odom_target, start, wide=True)
-                best = max(best, retried, key=lambda result: result.fitness)
-                if best.fitness >= self._config.good_fitness:
+        if self._is_doubtful(best, guess):
+            for target, T_odom_target, start, wide in self._other_attempts(prepared, guess):
+                tried = self._attempt(prepared, target, T_odom_target, start, wide=wide)
+                best = max(best, tried, key=lambda result: result.agreement)
+                if best.fitness >= self._config.good_fitness and wide:
                     break
         return best, self._objection(best, elapsed_s)
+
+    def _is_doubtful(self, result: Registration, guess: Pose) -> bool:
+        """Whether a result may be a wrong one nearby: it fits badly, or the motion is fast."""
+        if result.fitness < self._config.good_fitness:
+            return True
+        T_odom_camera = self._T_odom_keyframe @ result.T_target_source
+        return any(
+            np.linalg.norm(motion[:3, 3]) > SAFE_MOTION_M or rotation_angle(motion) > SAFE_TURN_RAD
+            for motion in (inverse(guess) @ T_odom_camera, inverse(self._T_odom_last) @ guess)
+        )
+
+    def _other_attempts(self, prepared: Any, guess: Pose) -> Iterator[tuple[Any, Pose, Pose, bool]]:
+        """Target, its pose, first guess and width of further attempts, the most promising first."""
+        keyframe, previous = (
+            (self._keyframe, self._T_odom_keyframe),
+            (self._previous, self._T_odom_last),
+        )
+        for target, T_odom_target in (keyframe, previous):
+            for proposed in self._registrar.propose(prepared, target):
+                yield target, T_odom_target, T_odom_target @ proposed, False
+        yield *keyframe, guess, True
+        yield *previous, guess, True
+        yield *previous, self._T_odom_last, True
 
     def _attempt(
         self, prepared: Any, target: Any, T_odom_target: Pose, guess: Pose, wide: bool
@@ -117,6 +139,8 @@ class KeyframeOdometry:
         """Why a result is not to be trusted; empty when it is."""
         if result.fitness < self._config.min_fitness:
             return f"only {result.fitness:.0%} of the points match"
+        if result.agreement < self._config.min_agreement:
+            return f"only {result.agreement:.0%} of the points match in depth and colour"
         motion = inverse(self._T_odom_last) @ self._T_odom_keyframe @ result.T_target_source
         speed = np.linalg.norm(motion[:3, 3]) / elapsed_s
         turn = np.rad2deg(rotation_angle(motion)) / elapsed_s

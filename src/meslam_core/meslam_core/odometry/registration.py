@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -39,12 +40,14 @@ class Registration:
             target axes.
         fitness: share of points with a correspondence.
         residual_m: RMS distance of the correspondences [m].
+        agreement: in [0, 1], of colour and depth together; ranks registrations of one pair.
     """
 
     T_target_source: Pose
     information: NDArray[np.float64]
     fitness: float
     residual_m: float
+    agreement: float = 0.0
 
 
 class Registrar(Protocol):
@@ -52,6 +55,10 @@ class Registrar(Protocol):
 
     def prepare(self, frame: RgbdFrame) -> Any:
         """What registration needs of a frame."""
+        ...
+
+    def propose(self, source: Any, target: Any) -> Iterator[Pose]:
+        """First guesses of T_target_source (4, 4) from the images alone, the best one first."""
         ...
 
     def register(
@@ -122,6 +129,9 @@ class HybridRegistrar:
         )
         return PreparedImages(image, o3d.core.Tensor(camera.matrix), depth, camera)
 
+    def propose(self, source: Any, target: Any) -> Iterator[Pose]:
+        return iter(())
+
     def register(
         self,
         source: PreparedImages,
@@ -151,7 +161,7 @@ class HybridRegistrar:
         transformation = result.transformation.numpy()
         residual_m = depth_residual_m(source, target, transformation, limit)
         return Registration(
-            transformation, _scaled(information.numpy(), residual_m), fitness, residual_m
+            transformation, _scaled(information.numpy(), residual_m), fitness, residual_m, fitness
         )
 
     def _hybrid(
@@ -228,6 +238,9 @@ class ColoredIcpRegistrar:
         cloud.orient_normals_towards_camera_location()
         return cloud
 
+    def propose(self, source: Any, target: Any) -> Iterator[Pose]:
+        return iter(())
+
     def register(
         self, source: Any, target: Any, T_target_source: Pose, *, wide: bool = False
     ) -> Registration:
@@ -257,4 +270,5 @@ class ColoredIcpRegistrar:
             _scaled(np.array(information), result.inlier_rmse),
             result.fitness,
             result.inlier_rmse,
+            result.fitness,
         )

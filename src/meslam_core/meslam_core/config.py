@@ -299,6 +299,9 @@ class MappingConfig:
     )
     first_iterations: int = setting(300, "steps on the first frame", minimum=1, maximum=10000)
     iterations: int = setting(24, "steps a frame", minimum=0, maximum=1000)
+    min_iterations: int = setting(
+        6, "steps a frame even while frames wait to be tracked", minimum=0, maximum=1000
+    )
     keyframe_iterations: int = setting(60, "steps on a new keyframe", minimum=0, maximum=1000)
     final_iterations: int = setting(
         4000, "steps after the last frame of a recording", minimum=0, maximum=100000
@@ -386,6 +389,9 @@ class RuntimeConfig:
     """How the computer is used."""
 
     threads: int = setting(1, "threads of one tensor operation on the CPU", minimum=1, maximum=256)
+    queue: int = setting(
+        4, "frames that odometry may be ahead of tracking", unit="frames", minimum=1, maximum=1000
+    )
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,17 @@ class PacedFrames:
         self._clock = clock
         self._sleep = sleep
         self.skipped = 0
+        self._started_s = 0.0
+        self._first_stamp_ns = 0
         self._error: Exception | None = None
 
     def __iter__(self) -> Iterator[RgbdFrame]:
         pending = self._next()
         first_stamp_ns = 0 if pending is None else pending.stamp_ns
         started = self._clock()
+        self._started_s, self._first_stamp_ns = started, first_stamp_ns
         while pending is not None:
-            wait_s = (pending.stamp_ns - first_stamp_ns) * 1e-9 - (self._clock() - started)
+            wait_s = -self.lateness_s(pending.stamp_ns)
             if wait_s > 0:
                 self._sleep(wait_s)
             now_ns = first_stamp_ns + round((self._clock() - started) * 1e9)
@@ -52,6 +55,11 @@ class PacedFrames:
             pending = following
         if self._error is not None:
             raise self._error
+
+    def lateness_s(self, stamp_ns: int) -> float:
+        """How long ago a frame was due [s]; negative while it is not yet."""
+        due_s = self._started_s + (stamp_ns - self._first_stamp_ns) * 1e-9
+        return self._clock() - due_s
 
     def _next(self) -> RgbdFrame | None:
         """The next frame; an error waits until the frames before it have been yielded."""

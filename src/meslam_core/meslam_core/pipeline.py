@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -18,6 +18,7 @@ from meslam_core.evaluation.report import truth_entries
 from meslam_core.map.store import MapStore
 from meslam_core.map.stored_region import snapshot
 from meslam_core.odometry import make_odometry
+from meslam_core.odometry_worker import OdometryWorker
 from meslam_core.pacing import PacedFrames
 from meslam_core.recordings.recording import Recording
 from meslam_core.results import MAP, ONLINE_TRAJECTORY, TRAJECTORY, ResultFolder
@@ -125,9 +126,9 @@ def run(
     limit_threads(config.runtime.threads)
     truth = None if options.truth is None else read_tum(options.truth)
     with ResultFolder(out_dir) as results:
-        slam = Slam(config, options.seed)
-        loop = _Loop(recording, slam, options, progress)
+        loop = _Loop(recording, config, options, progress)
         loop.run()
+        slam = loop.slam
         progress.stage("writing")
         refined = loop.tally.tracked(slam.trajectory())
         online = loop.tally.tracked(slam.online_trajectory())
@@ -153,19 +154,28 @@ class _Loop:
         broke_off: why the recording ended early; empty when it did not.
         interrupted: whether the user ended the loop.
         skipped: frames passed over to keep the recording's pace.
-        wall_s: time from before the first frame is read until the map is refined [s].
+        online_s: time from before the first frame is read until the last one is mapped [s].
+        wall_s: the same until the map is refined [s].
+        slam: what the frames are fed to.
     """
 
     def __init__(
-        self, recording: Recording, slam: Slam, options: RunOptions, progress: RunProgress
+        self,
+        recording: Recording,
+        config: MeslamConfig,
+        options: RunOptions,
+        progress: RunProgress,
     ) -> None:
         self.tally = Tally()
         self.broke_off = ""
         self.interrupted = False
         self.skipped = 0
+        self.online_s = 0.0
         self.wall_s = 0.0
+        self.slam = Slam(config, options.seed, frames_wait=self._frames_wait)
+        self._config = config
         self._recording = recording
-        self._slam = slam
+        self._worker: OdometryWorker | None = None
         self._options = options
         self._progress = progress
 
@@ -184,45 +194,54 @@ class _Loop:
                     f"{self._recording.name}: the chosen frames are none of its "
                     f"{len(self._recording)} frames; choose others"
                 )
+            self.online_s = time.perf_counter() - started
             if not self.interrupted:
                 self._progress.stage("refining")
-                self._slam.finish()
+                self.slam.finish()
         self.wall_s = time.perf_counter() - started
 
     def _feed(self, stop: threading.Event) -> None:
-        chosen, config = self._options.frames, self._slam.config
+        chosen, config = self._options.frames, self._config
         self._progress.started(len(range(*chosen.indices(len(self._recording)))))
         odometry = make_odometry(config.odometry, config.sensor)
         frames = self._recording.frames(chosen.start or 0, chosen.stop, chosen.step or 1)
         paced = PacedFrames(frames) if self._options.realtime else None
-        for frame in frames if paced is None else paced:
-            started = time.perf_counter()
-            estimate = odometry.process(frame)
-            odometry_ms = (time.perf_counter() - started) * 1e3
-            result = self._slam.process(frame, estimate)
-            self.tally.add(result, odometry_ms)
-            self.skipped = 0 if paced is None else paced.skipped
-            self._progress.processed(self.tally.frames + self.skipped, result)
-            if stop.is_set():
-                self.interrupted = True
-                return
+        self._worker = OdometryWorker(paced or frames, odometry, config.runtime.queue)
+        with closing(iter(self._worker)) as ready:
+            for timed in ready:
+                self.slam.track(timed.frame, timed.odometry)
+                if paced is not None:
+                    self.tally.lateness_ms.append(paced.lateness_s(timed.frame.stamp_ns) * 1e3)
+                    self.skipped = paced.skipped
+                result = self.slam.map()
+                self.tally.add(result, timed.reading_ms, timed.odometry_ms)
+                self._progress.processed(self.tally.frames + self.skipped, result)
+                if stop.is_set():
+                    self.interrupted = True
+                    return
+        self.slam.wait()
+
+    def _frames_wait(self) -> bool:
+        """Whether mapping is to give way: only at the recording's pace can it be too slow."""
+        return self._options.realtime and self._worker is not None and self._worker.waiting
 
     def report(self) -> dict[str, Any]:
         """The entries of `report.json` that the loop knows."""
         return {
             **self.tally.entries(),
-            **map_entries(self._slam),
+            **map_entries(self.slam),
             "frames_skipped": self.skipped,
+            "online_s": self.online_s,
             "wall_s": self.wall_s,
-            "fps": self.tally.frames / self.wall_s,
-            "final_state": self._slam.state.name,
+            "fps": self.tally.frames / self.online_s,
+            "final_state": self.slam.state.name,
             "broke_off": self.broke_off or None,
             "interrupted": self.interrupted,
             "recording": self._recording.name,
             "camera": self._recording.camera.to_dict(),
             "seed": self._options.seed,
             "realtime": self._options.realtime,
-            "config": self._slam.config.to_mapping(),
+            "config": self._config.to_mapping(),
         }
 
 

@@ -17,6 +17,9 @@ from meslam_core.regions.observed_mask import OBSERVED, ObservedMask
 from meslam_core.slam import FrameResult, Slam, TrackingState
 from meslam_core.trajectory import Trajectory
 
+# A pose that is known later than this after its image was due is late.
+LATE_MS = 100.0
+
 
 @dataclass
 class Tally:
@@ -27,11 +30,13 @@ class Tally:
     tracked_stamps_ns: list[int] = field(default_factory=list)
     first_stamp_ns: int = 0
     last_stamp_ns: int = 0
+    reading_ms: list[float] = field(default_factory=list)
     odometry_ms: list[float] = field(default_factory=list)
+    lateness_ms: list[float] = field(default_factory=list)
     tracking_ms: list[float] = field(default_factory=list)
     mapping_ms: list[float] = field(default_factory=list)
 
-    def add(self, result: FrameResult, odometry_ms: float) -> None:
+    def add(self, result: FrameResult, reading_ms: float, odometry_ms: float) -> None:
         """Count one processed frame."""
         if not self.frames:
             self.first_stamp_ns = result.stamp_ns
@@ -40,6 +45,7 @@ class Tally:
         self.degraded += result.state is TrackingState.DEGRADED
         if is_tracked(result):
             self.tracked_stamps_ns.append(result.stamp_ns)
+        self.reading_ms.append(reading_ms)
         self.odometry_ms.append(odometry_ms)
         self.tracking_ms.append(result.tracking_ms)
         self.mapping_ms.append(result.mapping_ms)
@@ -53,7 +59,10 @@ class Tally:
             "frames_lost": self.frames - tracked,
             "frames_degraded": self.degraded,
             "sensor_s": (self.last_stamp_ns - self.first_stamp_ns) * 1e-9,
+            "lateness_ms": _spread(self.lateness_ms),
+            "frames_late": sum(ms > LATE_MS for ms in self.lateness_ms),
             "stage_ms": {
+                "reading": _spread(self.reading_ms),
                 "odometry": _spread(self.odometry_ms),
                 "tracking": _spread(self.tracking_ms),
                 "mapping": _spread(self.mapping_ms),

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,3 +102,38 @@ class FusedField:
         huber: float,
         color_weight: float,
     ) -> tuple[_Doubles, _Doubles, _Floats, NDArray[np.bool_]]: ...
+
+class RgbdPyramid:
+    def __init__(
+        self,
+        gray: NDArray[np.uint8],
+        depth: _Floats,
+        *,
+        min_depth: float,
+        max_depth: float,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        halvings: int,
+        levels: int,
+    ) -> None: ...
+    @property
+    def levels(self) -> int: ...
+    @property
+    def measured(self) -> int: ...
+
+def align_rgbd(
+    source: RgbdPyramid,
+    target: RgbdPyramid,
+    T_target_source: _Doubles,
+    *,
+    finest: int,
+    levels: int,
+    iterations: int,
+    max_distance: float,
+    convergence: float,
+    correlated: float,
+    luma_bias_m: float,
+    luma_bias_rad: float,
+) -> dict[str, Any]: ...

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,11 +26,17 @@ STEPS_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class StepLosses:
-    """Mean weighted losses of one or several steps, without unit."""
+    """Mean weighted losses of one or several steps, without unit.
+
+    Attributes:
+        distance, depth, color: of the signed distance, the rendered depth and colour.
+        steps: how many steps they are of.
+    """
 
     distance: float = 0.0
     depth: float = 0.0
     color: float = 0.0
+    steps: int = 0
 
     @property
     def total(self) -> float:
@@ -61,6 +69,7 @@ class JointOptimizer:
         T_map_current: Pose | None = None,
         refine_poses: bool = True,
         rate_factor: float = 1.0,
+        enough: Callable[[int], bool] = lambda done: False,
     ) -> StepLosses:
         """Run `steps` steps on a region and return their mean losses.
 
@@ -73,17 +82,23 @@ class JointOptimizer:
             T_map_current: (4, 4) pose of the current frame, held fixed.
             refine_poses: whether keyframe poses move.
             rate_factor: of the weights' learning rate.
+            enough: is asked before every step, with the number of those done, whether to end.
         """
         if T_map_current is None or not self.config.current_rays:
             current = None
-        sums = np.zeros(3)
-        for done in range(0, steps, STEPS_AT_ONCE):
+        sums, done = np.zeros(3), 0
+        while done < steps and not enough(done):
             draws = self._draw(region, min(STEPS_AT_ONCE, steps - done), current)
             batches = self._batches(region, draws, current, refine_poses)
             pose = None if current is None else T_map_current
             rate = self.config.learning_rate * rate_factor
-            sums += self._run(region, draws, batches, pose, refine_poses, rate)
-        return StepLosses(*(sums / max(steps, 1)).tolist())
+            added, taken = self._run(
+                region, draws, batches, pose, refine_poses, rate, partial(_after, enough, done)
+            )
+            sums += added
+            done += taken
+        distance, depth, color = (sums / max(done, 1)).tolist()
+        return StepLosses(distance, depth, color, done)
 
     def _run(
         self,
@@ -93,21 +108,26 @@ class JointOptimizer:
         T_map_current: Pose | None,
         refine_poses: bool,
         learning_rate: float,
-    ) -> NDArray[np.float64]:
-        """Take the steps that were drawn; returns the sum (3,) of their mean losses."""
+        enough: Callable[[int], bool],
+    ) -> tuple[NDArray[np.float64], int]:
+        """Take the steps that were drawn; the sum (3,) of their mean losses, and their number."""
         poses = self.poses.start(draws.keyframes, T_map_current, self._generator)
         sums = np.zeros(3)
         remembered = np.empty(draws.chosen.shape, np.float32)
+        taken = 0
         for number in range(len(draws)):
+            if enough(number):
+                break
             losses, gradient = batches.train(number, poses.rotations, poses.translations)
             if region.field.step(learning_rate) and refine_poses:
                 poses.move(gradient)
             sums += losses.mean(axis=0)
             losses[: draws.chosen.shape[1]].sum(axis=1, out=remembered[number])
+            taken += 1
         if refine_poses:
             poses.finish()
-        self._remember(draws, remembered)
-        return sums
+        self._remember(draws.chosen[:taken], draws.keyframes, remembered[:taken])
+        return sums, taken
 
     def _draw(self, region: Region, steps: int, current: Rays | None) -> RayDraws:
         members = np.array(region.keyframes, np.int64)
@@ -138,16 +158,25 @@ class JointOptimizer:
             refine_poses,
         )
 
-    def _remember(self, draws: RayDraws, losses: NDArray[np.float32]) -> None:
-        """Update the running loss of the keyframes that took part, by losses (T, R)."""
-        shape = len(draws), len(draws.keyframes)
-        cells = (draws.chosen + shape[1] * np.arange(shape[0])[:, None]).reshape(-1)
+    def _remember(
+        self,
+        chosen: NDArray[np.int64],
+        keyframes: NDArray[np.int64],
+        losses: NDArray[np.float32],
+    ) -> None:
+        """Update the running loss of `keyframes` (A,) by losses (T, R) of the `chosen` ones."""
+        shape = len(chosen), len(keyframes)
+        cells = (chosen + shape[1] * np.arange(shape[0])[:, None]).reshape(-1)
         counts = np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
-        sums = np.bincount(draws.chosen.reshape(-1), losses.reshape(-1), minlength=shape[1])
+        sums = np.bincount(chosen.reshape(-1), losses.reshape(-1), minlength=shape[1])
         rays = counts.sum(axis=0)
         seen = (rays > 0) & np.isfinite(sums)
         # As if the mean had come again in every step that the keyframe took part in.
         memory = LOSS_MEMORY ** np.count_nonzero(counts, axis=0)[seen]
-        numbers = draws.keyframes[seen]
+        numbers = keyframes[seen]
         running = self.keyframes.loss_array()
         running[numbers] = memory * running[numbers] + (1 - memory) * (sums[seen] / rays[seen])
+
+
+def _after(enough: Callable[[int], bool], done: int, more: int) -> bool:
+    return enough(done + more)

@@ -52,7 +52,7 @@ def find_features(
     keypoints, descriptors = detector.detectAndCompute(gray, None)
     if not keypoints:
         descriptors = np.zeros((0, 32), np.uint8)
-    pixels = cv2.KeyPoint.convert(keypoints).astype(np.float32).reshape(-1, 2)
+    pixels = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2)
     columns, rows = np.rint(pixels).astype(int).T
     depth = depth_m[rows, columns]
     points = camera.ray_directions(pixels[:, 0], pixels[:, 1]) * depth[:, None]

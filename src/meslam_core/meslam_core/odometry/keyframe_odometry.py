@@ -68,7 +68,7 @@ class KeyframeOdometry:
         if valid:
             T_odom_camera = orthonormalized(self._T_odom_keyframe @ registration.T_target_source)
         motion = inverse(self._T_odom_last) @ T_odom_camera
-        self._velocity = log(motion) / elapsed_s if valid else 0.5 * self._velocity
+        self._velocity = np.asarray(log(motion) / elapsed_s if valid else 0.5 * self._velocity)
         self._T_odom_last, self._last_stamp_ns = T_odom_camera, frame.stamp_ns
         self._failures = 0 if valid else self._failures + 1
         self._previous = prepared
@@ -165,5 +165,4 @@ def _covariance(registration: Registration, valid: bool) -> NDArray[np.float64]:
     if not valid:
         return np.eye(6) * UNKNOWN_VARIANCE
     information = registration.information + np.eye(6) / UNKNOWN_VARIANCE
-    covariance: NDArray[np.float64] = np.linalg.inv(information)
-    return covariance
+    return np.asarray(np.linalg.inv(information), np.float64)

@@ -1,0 +1,159 @@
+"""All frames' poses: each relative to a keyframe, so that it moves when the keyframe does."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meslam_core.mapping.keyframes import KeyframeStore
+from meslam_core.odometry import OdometryEstimate
+from meslam_core.se3 import Pose, exp, inverse, log, orthonormalized
+from meslam_core.trajectory import Trajectory
+
+# Odometry is carried over at most so many frames that have none.
+MAX_ODOMETRY_GAP = 10
+# A motion is extrapolated to at most so many times its duration.
+MAX_EXTRAPOLATION = 3.0
+
+
+class KeyframePoses:
+    """Poses of all keyframes at one moment; training that goes on does not change them."""
+
+    def __init__(self, keyframes: KeyframeStore) -> None:
+        rotations, translations = keyframes.pose_arrays()
+        self._rotations = rotations.copy()
+        self._translations = translations.copy()
+
+    def __len__(self) -> int:
+        return len(self._translations)
+
+    def pose(self, index: int) -> Pose:
+        """T_map_camera (4, 4) of a keyframe."""
+        pose = np.eye(4)
+        pose[:3, :3] = self._rotations[index]
+        pose[:3, 3] = self._translations[index]
+        return pose
+
+    def compose(
+        self, indices: NDArray[np.int64], T_keyframe_camera: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """T_map_camera (N, 4, 4) from keyframe numbers (N,) and poses (N, 4, 4) in them."""
+        poses = np.tile(np.eye(4), (len(indices), 1, 1))
+        poses[:, :3, :3] = self._rotations[indices]
+        poses[:, :3, 3] = self._translations[indices]
+        composed: NDArray[np.float64] = np.matmul(poses, T_keyframe_camera)
+        return composed
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """A frame that has odometry, by its place in the history."""
+
+    number: int
+    odometry: OdometryEstimate
+
+
+class FrameHistory:
+    """Stamps and poses of the frames so far, a few hundred bytes each.
+
+    Attributes:
+        keyframes: poses that the frames' poses are given by; replaced when keyframes moved.
+    """
+
+    def __init__(self) -> None:
+        self.keyframes: KeyframePoses | None = None
+        self._count = 0
+        self._stamps_ns = np.zeros(64, np.int64)
+        self._references = np.zeros(64, np.int64)
+        self._relative = np.zeros((64, 4, 4))
+        self._online = np.zeros((64, 4, 4))
+        self._measured: deque[_Measured] = deque(maxlen=MAX_ODOMETRY_GAP)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(
+        self,
+        stamp_ns: int,
+        T_map_camera: Pose,
+        reference: int,
+        T_keyframe_camera: Pose,
+        odometry: OdometryEstimate | None,
+    ) -> None:
+        """Append a frame.
+
+        Args:
+            stamp_ns: of its image [ns].
+            T_map_camera: (4, 4) as it is known now: the online pose.
+            reference: number of its keyframe.
+            T_keyframe_camera: (4, 4) in that keyframe.
+            odometry: its estimate, where there is one.
+        """
+        if self._count == len(self._stamps_ns):
+            for name in ("_stamps_ns", "_references", "_relative", "_online"):
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
+        self._stamps_ns[self._count] = stamp_ns
+        self._references[self._count] = reference
+        self._relative[self._count] = T_keyframe_camera
+        self._online[self._count] = T_map_camera
+        if odometry is not None:
+            self._measured.append(_Measured(self._count, odometry))
+        self._count += 1
+
+    @property
+    def newest_keyframe(self) -> int:
+        """Number of the latest keyframe."""
+        assert self.keyframes is not None
+        return len(self.keyframes) - 1
+
+    def keyframe_pose(self, keyframe: int) -> Pose:
+        """T_map_camera (4, 4) of a keyframe as it is known now."""
+        assert self.keyframes is not None
+        return self.keyframes.pose(keyframe)
+
+    def pose(self, number: int) -> Pose:
+        """T_map_camera (4, 4) of a frame as it is known now; -1 is the latest."""
+        assert self.keyframes is not None
+        number = number + self._count if number < 0 else number
+        reference = self.keyframes.pose(int(self._references[number]))
+        return np.asarray(reference @ self._relative[number], np.float64)
+
+    def extrapolated(self, stamp_ns: int) -> Pose:
+        """T_map_camera (4, 4) at a time after the latest frame, its motion continued."""
+        latest = self.pose(-1)
+        if self._count < 2:
+            return latest
+        before_ns, last_ns = self._stamps_ns[self._count - 2 : self._count]
+        ahead = min((stamp_ns - last_ns) / max(last_ns - before_ns, 1), MAX_EXTRAPOLATION)
+        motion = log(orthonormalized(inverse(self.pose(-2)) @ latest))
+        return orthonormalized(latest @ exp(ahead * motion))
+
+    def moved(self, odometry: OdometryEstimate | None) -> tuple[Pose, Pose] | None:
+        """Pose of the last frame that has odometry, and odometry's motion since, both (4, 4).
+
+        None where there is no valid odometry to go by.
+        """
+        if odometry is None or not odometry.valid or not self._measured:
+            return None
+        last = self._measured[-1]
+        if self._count - last.number > MAX_ODOMETRY_GAP:
+            return None
+        motion = inverse(last.odometry.T_odom_camera) @ odometry.T_odom_camera
+        return self.pose(last.number), motion
+
+    def trajectory(self) -> Trajectory:
+        """T_map_camera of every frame as it is known now."""
+        poses = np.zeros((0, 4, 4))
+        if self._count:
+            assert self.keyframes is not None
+            references = self._references[: self._count]
+            poses = self.keyframes.compose(references, self._relative[: self._count])
+        return Trajectory(self._stamps_ns[: self._count].copy(), poses)
+
+    def online_trajectory(self) -> Trajectory:
+        """T_map_camera of every frame as it was known when the frame was done."""
+        return Trajectory(self._stamps_ns[: self._count].copy(), self._online[: self._count].copy())

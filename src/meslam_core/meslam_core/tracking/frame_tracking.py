@@ -1,0 +1,166 @@
+"""A frame's pose: first guesses, alignment with the map, and how far the result is trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meslam_core.config import TrackingConfig
+from meslam_core.frame_result import TrackingState
+from meslam_core.mapping.keyframes import Rays
+from meslam_core.odometry import OdometryEstimate
+from meslam_core.regions.region import Region
+from meslam_core.se3 import Pose, orthonormalized, rotation_angle
+from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
+from meslam_core.tracking.frame_history import FrameHistory
+
+# Below this share of inliers the other first guesses are tried too.
+CONFIDENT_INLIERS = 0.85
+UNTRUSTED_VARIANCE = 0.25
+FIRST_VARIANCE = 1e-8
+
+
+@dataclass(frozen=True)
+class TrackedPose:
+    """A pose and what it rests on.
+
+    Attributes:
+        T_map_camera: (4, 4).
+        covariance: (6, 6) of (translation [m], rotation [rad]), map axes.
+        trusted: whether it may train the map.
+        reason: why the field did not confirm it; empty where it did.
+        alignment: with the field, where there was enough to align.
+    """
+
+    T_map_camera: Pose
+    covariance: NDArray[np.float64]
+    trusted: bool
+    reason: str
+    alignment: Alignment | None
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """Whether a frame's pose may train the map, and whether the field confirmed it."""
+
+    trusted: bool
+    by_field: bool = False
+    reason: str = ""
+
+
+class FrameTracking:
+    """Finds the pose of one frame after the other.
+
+    Args:
+        config: limits of what is believed.
+
+    Attributes:
+        history: of all frames; who maps the frame adds it.
+        state: after the latest frame.
+    """
+
+    def __init__(self, config: TrackingConfig) -> None:
+        self.config = config
+        self.history = FrameHistory()
+        self.state = TrackingState.INITIALISING
+        self._tracker = FieldTracker(config)
+        self._untrusted = 0
+        self._covariance = np.eye(6) * FIRST_VARIANCE
+
+    def start(self, T_map_camera: Pose) -> TrackedPose:
+        """The first frame's pose is given."""
+        self.state = TrackingState.OK
+        return TrackedPose(T_map_camera, self._covariance, trusted=True, reason="", alignment=None)
+
+    def track(
+        self, stamp_ns: int, region: Region, rays: Rays | None, odometry: OdometryEstimate | None
+    ) -> TrackedPose:
+        """Find a frame's pose.
+
+        Args:
+            stamp_ns: of its image [ns].
+            region: the working region.
+            rays: of the frame, camera frame; None where it has too little depth.
+            odometry: its estimate, where there is one.
+        """
+        alignment = None
+        verdict = _Verdict(trusted=False, reason="too few pixels with depth")
+        if rays is not None:
+            alignment = self._align(stamp_ns, region, rays, odometry)
+            verdict = self._judge(alignment, odometry)
+        if alignment is not None and verdict.by_field:
+            self._untrusted = 0
+            self.state = TrackingState.OK
+            pose = alignment.T_map_camera
+            self._covariance = inverted(alignment.information + np.eye(6))
+        else:
+            self._untrusted = 0 if verdict.trusted else self._untrusted + 1
+            lost = self._untrusted >= self.config.lost_after_frames
+            self.state = TrackingState.LOST if lost else TrackingState.DEGRADED
+            pose = self._guesses(stamp_ns, odometry)[0]
+            self._covariance = np.eye(6) * UNTRUSTED_VARIANCE
+        return TrackedPose(pose, self._covariance, verdict.trusted, verdict.reason, alignment)
+
+    def _align(
+        self, stamp_ns: int, region: Region, rays: Rays, odometry: OdometryEstimate | None
+    ) -> Alignment:
+        """The best alignment with a region from all first guesses that are worth trying."""
+        guesses = self._guesses(stamp_ns, odometry)
+        costs = [self._tracker.robust_cost(region, rays, guess) for guess in guesses]
+        prior = self._prior(odometry)
+        alignments: list[Alignment] = []
+        for index in np.argsort(costs):
+            alignments.append(self._tracker.align(region, rays, guesses[index], prior))
+            if alignments[-1].inlier_ratio > CONFIDENT_INLIERS:
+                break
+        return max(alignments, key=lambda alignment: alignment.inlier_ratio)
+
+    def _prior(self, odometry: OdometryEstimate | None) -> PosePrior | None:
+        """The last pose moved by odometry, as certain as both are."""
+        moved = self.history.moved(odometry)
+        if moved is None:
+            return None
+        T_map_last, motion = moved
+        distance = float(np.linalg.norm(motion[:3, 3]))
+        sigma_m = self.config.odometry_sigma_m + self.config.odometry_drift * distance
+        sigma_rad = np.deg2rad(self.config.odometry_sigma_deg)
+        sigma_rad += self.config.odometry_drift * rotation_angle(motion)
+        variances = np.repeat([sigma_m**2, sigma_rad**2], 3)
+        covariance = self._covariance + np.diag(variances)
+        return PosePrior(orthonormalized(T_map_last @ motion), inverted(covariance))
+
+    def _guesses(self, stamp_ns: int, odometry: OdometryEstimate | None) -> list[Pose]:
+        """First guesses of a pose: odometry since the last frame, constant velocity, standstill."""
+        guesses = []
+        moved = self.history.moved(odometry)
+        if moved is not None:
+            guesses.append(moved[0] @ moved[1])
+        guesses.append(self.history.extrapolated(stamp_ns))
+        guesses.append(self.history.pose(-1))
+        return [orthonormalized(guess) for guess in guesses]
+
+    def _judge(self, alignment: Alignment, odometry: OdometryEstimate | None) -> _Verdict:
+        """Whether an alignment may be trusted, or odometry in its place."""
+        limits = self.config
+        if not np.isfinite(alignment.T_map_camera).all():
+            return _Verdict(trusted=False, reason="the pose is not finite")
+        if alignment.observed_ratio < limits.min_observed_ratio:
+            # Beyond what is mapped only odometry knows; without it the map could not grow.
+            return _Verdict(
+                trusted=odometry is not None and odometry.valid,
+                reason=f"only {alignment.observed_ratio:.0%} of the view is mapped",
+            )
+        if alignment.inlier_ratio < limits.min_inlier_ratio:
+            share = f"{alignment.inlier_ratio:.0%}"
+            return _Verdict(trusted=False, reason=f"only {share} of the points lie on the map")
+        if alignment.residual_m > limits.max_residual_m:
+            distance = f"{alignment.residual_m * 100:.1f} cm"
+            return _Verdict(trusted=False, reason=f"points lie {distance} off the map")
+        return _Verdict(trusted=True, by_field=True)
+
+
+def inverted(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of a covariance or information matrix (6, 6)."""
+    return np.asarray(np.linalg.inv(matrix), np.float64)

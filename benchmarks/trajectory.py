@@ -30,6 +30,7 @@ from peers import pose_graph_slam, tsdf_slam
 from rich.console import Console
 from trajectory_figures import Path3d, plot, spread, table_of
 
+from meslam_core.errors import EvaluationError
 from meslam_core.evaluation.trajectory_error import (
     AbsoluteError,
     absolute_error,
@@ -50,6 +51,8 @@ METHODS = {
     "tsdf": "TSDF SLAM (Open3D)",
     "pose_graph": "RGB-D odometry and pose graph (Open3D, GTSAM)",
 }
+# The peers may have settings of their own for a camera; MeSLAM has the same for all.
+SETTINGS = {"tsdf": tsdf_slam.SETTINGS, "pose_graph": pose_graph_slam.SETTINGS}
 TRIED = {"tsdf": tsdf_slam.TRIED, "pose_graph": pose_graph_slam.TRIED}
 FIGURES = (
     "frames_tracked",
@@ -120,7 +123,9 @@ class Job:
             lever_arm = ["--lever-arm"] if SEQUENCES[self.recording].lever_arm else []
             seed = ["--seed", str(self.seed)]
             return [program, "run", *common, "--truth", truth, *lever_arm, *seed]
-        return [sys.executable, "-m", "peers", self.method, *common]
+        best = SETTINGS[self.method].get(self.recording, ())
+        settings = [word for setting in best for word in ("--set", setting)]
+        return [sys.executable, "-m", "peers", self.method, *common, *settings]
 
 
 def run(job: Job, data: Path) -> None:
@@ -137,15 +142,21 @@ def run(job: Job, data: Path) -> None:
         if hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: job.cores])
 
-    subprocess.run(
-        job.command(data), cwd=HERE, env=environment, check=True, preexec_fn=confine
-    )
+    subprocess.run(job.command(data), cwd=HERE, env=environment, check=True, preexec_fn=confine)
 
 
 def held(trajectory: Trajectory, stamps_ns: np.ndarray) -> Trajectory:
     """Poses at all stamps of the frames; one that was not tracked has the last pose before it."""
     last = np.searchsorted(trajectory.stamps_ns, stamps_ns, side="right") - 1
     return Trajectory(stamps_ns, trajectory.poses[np.maximum(last, 0)])
+
+
+def error_of(trajectory: Trajectory, truth: Trajectory, sequence: Sequence) -> AbsoluteError:
+    """ATE; without a lever arm where the trajectory turns too little to tell it (lost early)."""
+    try:
+        return absolute_error(trajectory, truth, hand_eye=sequence.lever_arm)
+    except EvaluationError:
+        return absolute_error(trajectory, truth)
 
 
 def evaluated(job: Job, data: Path) -> tuple[dict[str, Any], AbsoluteError]:
@@ -158,8 +169,8 @@ def evaluated(job: Job, data: Path) -> tuple[dict[str, Any], AbsoluteError]:
     report = json.loads((job.out / REPORT).read_text())
     refined = read_tum(job.out / TRAJECTORY)
     online = read_tum(job.out / ONLINE_TRAJECTORY)
-    absolute = absolute_error(held(refined, stamps_ns), truth, hand_eye=sequence.lever_arm)
-    live = absolute_error(held(online, stamps_ns), truth, hand_eye=sequence.lever_arm)
+    absolute = error_of(held(refined, stamps_ns), truth, sequence)
+    live = error_of(held(online, stamps_ns), truth, sequence)
     mounting = live.mounting
     tracked = online.transformed(mounting.T_truth_map, mounting.T_camera_sensor)
     return {
@@ -168,7 +179,7 @@ def evaluated(job: Job, data: Path) -> tuple[dict[str, Any], AbsoluteError]:
         "frames_tracked": len(online),
         "ate_m": absolute.rmse_m,
         "ate_online_m": live.rmse_m,
-        "ate_tracked_m": absolute_error(refined, truth, hand_eye=sequence.lever_arm).rmse_m,
+        "ate_tracked_m": error_of(refined, truth, sequence).rmse_m,
         "jitter_rms_m": frame_jitter_m(tracked, truth),
         "jitter_median_m": float(
             np.median(relative_error_by_frames(tracked, truth).translations_m)

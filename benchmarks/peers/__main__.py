@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import gtsam  # noqa: F401
-
 from meslam_core.recordings import open_recording
 from peers.peer import Peer, run_peer
 from peers.pose_graph_slam import PoseGraphSlam, PoseGraphSlamConfig

@@ -12,6 +12,7 @@ from rclpy.qos import ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
+from meslam_core.config import MeslamConfig
 from meslam_core.se3 import inverse
 from meslam_core.slam import T_BODY_OPTICAL
 from meslam_interfaces.msg import RegionModel, TrackingStatus
@@ -141,6 +142,26 @@ def rotation(x: float, y: float, z: float, w: float) -> np.ndarray:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+@pytest.mark.parametrize("give_way", [True, False])
+def test_training_gives_way_only_to_pairs_that_wait(start_node, client, give_way: bool) -> None:
+    steps = 300
+    trained = {"mapping__iterations": steps, "mapping__keyframe_iterations": steps}
+    start_node(TrackingNode, **FAST | trained | {"give_way": give_way})
+    camera = Camera(client)
+    camera.wait()
+    # A status tells of the training on the frame before.
+    in_lockstep = [camera.track(number).iterations for number in range(3)]
+    assert in_lockstep == [FAST["mapping__first_iterations"]] * 2 + [steps]
+    numbers = range(3, 9)
+    for number in numbers:
+        camera.send(number)
+    assert client.spin_until(lambda: len(client.statuses) > numbers[-1], ANSWER_S)
+    *while_pairs_wait, at_the_end = [status.iterations for status in client.statuses[3:]]
+    assert all((taken < steps) == give_way for taken in while_pairs_wait), while_pairs_wait
+    assert min(while_pairs_wait) >= MeslamConfig().mapping.min_iterations
+    assert at_the_end == steps
 
 
 def test_tracking_goes_on_without_odometry_and_without_a_base(start_node, client) -> None:

@@ -6,11 +6,11 @@ import sys
 from collections import Counter
 from typing import Any
 
-import torch
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
 from meslam_core.errors import MapError
 from meslam_core.se3 import Pose
+from meslam_core.threads import limit_threads
 from meslam_interfaces.msg import RegionModel
 from meslam_interfaces.srv import (
     ExportMap,
@@ -45,7 +45,7 @@ class MapServerNode(ManagedNode):
         self._frames = declare_settings(self, MapFrameSettings)
         self._settings = declare_settings(self, MapServerSettings)
         self._config = declare_config(self, ("regions", "map", "runtime"))
-        torch.set_num_threads(self._config.runtime.threads)
+        limit_threads(self._config.runtime.threads)
 
     def configure(self) -> None:
         self._models = MapModels(self._config, self._frames.map_frame)

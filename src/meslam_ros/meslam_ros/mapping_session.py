@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import uuid
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, nullcontext
 
 from meslam_core import se3
 from meslam_core.config import MeslamConfig
@@ -23,53 +24,92 @@ WITH_POSE = (TrackingState.OK, TrackingState.DEGRADED)
 class MappingSession:
     """From an empty map to a reset. The map frame is where the first base was.
 
+    Every frame takes three steps: `track`, `wait`, `map`. Training runs beside them from one `map`
+    to the next `wait`; only between `wait` and `map` do the regions keep still.
+
     Args:
         config: of the method.
         seed: of every random choice.
+        frames_wait: whether frames wait to be tracked, asked by the training thread; while they
+            do and training holds them up, it gives way.
 
     Attributes:
         map_id: identifies the map.
         received, tracked: frames so far, and those with a pose.
         discarded: frames that were not processed, by reason.
         result: of the latest frame.
+        mapped_ns: stamp of the newest frame that the map was trained with [ns].
     """
 
-    def __init__(self, config: MeslamConfig, seed: int) -> None:
+    def __init__(
+        self, config: MeslamConfig, seed: int, frames_wait: Callable[[], bool] = lambda: False
+    ) -> None:
         self.map_id = uuid.uuid4().hex
         self.received = 0
         self.tracked = 0
         self.discarded: Counter[str] = Counter()
         self.result: FrameResult | None = None
+        self.mapped_ns = 0
         self._config = config
         self._seed = seed
+        self._frames_wait = frames_wait
+        self._held_up = False
         self._slam: Slam | None = None
         self._mount: CameraMount | None = None
         self._refined_steps = 0
 
-    def process(
-        self,
-        frame: RgbdFrame,
-        mount: CameraMount,
-        odometry: OdometryEstimate | None,
-        effort: float = 1.0,
+    def track(
+        self, frame: RgbdFrame, mount: CameraMount, odometry: OdometryEstimate | None
     ) -> FrameResult:
-        """Track and map one frame.
+        """Find the pose of a frame; `map` must follow.
 
         Args:
             frame: the next one.
             mount: of the camera on the base.
             odometry: of the frame, where there is one.
-            effort: share of the configured mapping steps to take, in (0, 1].
         """
         if self._slam is None:
             T_map_camera = first_base_pose(mount) @ mount.T_base_optical
-            self._slam, self._mount = Slam(self._config, self._seed, T_map_camera), mount
+            self._slam = Slam(self._config, self._seed, T_map_camera, self._must_give_way)
+            self._mount = mount
         self.received += 1
         self._refined_steps = 0
-        self._slam.effort = effort
-        self.result = self._slam.process(frame, odometry)
+        self.result = self._slam.track(frame, odometry)
         self.tracked += self.has_pose
         return self.result
+
+    def wait(self) -> None:
+        """Wait until the frames before are mapped; afterwards the regions keep still."""
+        if self._slam is not None:
+            with self._waiting():
+                self._slam.wait()
+
+    def map(self) -> FrameResult:
+        """Begin to train the map with the tracked frame; all that is known of it now."""
+        assert self._slam is not None
+        self.wait()
+        # Training on the first frame ends before `map` does; later it only begins.
+        with self._waiting() if self._slam.atlas is None else nullcontext():
+            self.result = self._slam.map()
+        self.mapped_ns = self.result.stamp_ns
+        return self.result
+
+    @contextmanager
+    def _waiting(self) -> Iterator[None]:
+        self._held_up = True
+        try:
+            yield
+        finally:
+            self._held_up = False
+
+    def _must_give_way(self) -> bool:
+        """Whether training holds up frames that wait.
+
+        A frame that waits while tracking is at work, or is only just being handed over, waits for
+        something else: then training may as well go on. So a recording that is played in lockstep
+        is mapped the same however slow the computer is.
+        """
+        return self._held_up and self._frames_wait()
 
     def refine(self) -> bool:
         """Refine the map for a moment while no image comes; False when that is done."""

@@ -66,7 +66,7 @@ class ModelPublisher:
             self._node.destroy_publisher(publisher)
 
     def offer(self, regions: Iterable[Region], stamp_ns: int, final: bool = False) -> None:
-        """Take what has changed for publication; called by the thread that trains the regions.
+        """Take what has changed for publication; called while nothing trains the regions.
 
         Args:
             regions: of the map.

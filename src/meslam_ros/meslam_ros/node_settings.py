@@ -83,8 +83,9 @@ class TrackingSettings:
         minimum=0.0,
         maximum=10.0,
     )
-    adapt_effort: bool = setting(
-        True, "take fewer mapping steps a frame while image pairs queue up, down to a tenth"
+    give_way: bool = setting(
+        True,
+        "while image pairs wait, training of the map ends after mapping.min_iterations steps",
     )
     transform_rate_hz: float = setting(
         20.0,
@@ -200,7 +201,11 @@ class PlayerSettings:
         maximum=100.0,
     )
     window: int = setting(
-        2, "with rate 0: image pairs that may be under way", minimum=1, maximum=30
+        1,
+        "with rate 0: image pairs that may be under way; with more than one, pairs wait at the "
+        "tracking node, and training gives way to them unless give_way is off",
+        minimum=1,
+        maximum=30,
     )
     start: float = setting(
         0.0, "where in the recording to start", unit="s", minimum=0.0, maximum=1e6

@@ -6,11 +6,11 @@ import sys
 import time
 from typing import Any
 
-import torch
 from nav_msgs.msg import Odometry
 
 from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import OdometryEstimate, make_odometry
+from meslam_core.threads import limit_threads
 from meslam_ros import topics
 from meslam_ros.conversions import from_pose
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
@@ -34,7 +34,7 @@ class OdometryNode(ManagedNode):
         self._inputs = declare_settings(self, InputSettings)
         self._settings = declare_settings(self, OdometrySettings)
         self._config = declare_config(self, ("sensor", "odometry", "runtime"))
-        torch.set_num_threads(self._config.runtime.threads)
+        limit_threads(self._config.runtime.threads)
 
     def configure(self) -> None:
         self._publisher = self.create_publisher(Odometry, topics.ODOMETRY, STREAM)

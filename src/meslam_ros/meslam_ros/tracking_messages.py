@@ -72,7 +72,7 @@ def status_message(result: FrameResult, head: Header) -> TrackingStatus:
         loss_distance=float(result.losses.distance),
         loss_depth=float(result.losses.depth),
         loss_color=float(result.losses.color),
-        iterations=int(result.iterations),
+        iterations=int(result.losses.steps),
         is_keyframe=bool(result.is_keyframe),
         tracking_ms=float(result.tracking_ms),
         mapping_ms=float(result.mapping_ms),

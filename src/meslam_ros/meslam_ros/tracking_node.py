@@ -6,7 +6,6 @@ import sys
 import time
 from typing import Any
 
-import torch
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from std_srvs.srv import SetBool, Trigger
@@ -15,11 +14,11 @@ from meslam_core import se3
 from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import OdometryEstimate
-from meslam_core.slam import TrackingState
+from meslam_core.slam import FrameResult, TrackingState
+from meslam_core.threads import limit_threads
 from meslam_interfaces.msg import RegionIndex, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
-from meslam_ros.effort import MappingEffort
 from meslam_ros.frame_worker import WARNING_PERIOD_S, FrameWorker
 from meslam_ros.image_synchronizer import ImagePair
 from meslam_ros.managed_node import ManagedNode, run
@@ -55,7 +54,7 @@ class TrackingNode(ManagedNode):
         self._inputs = declare_settings(self, InputSettings)
         self._settings = declare_settings(self, TrackingSettings)
         self._config = declare_config(self, MeslamConfig().to_mapping())
-        torch.set_num_threads(self._config.runtime.threads)
+        limit_threads(self._config.runtime.threads)
 
     def configure(self) -> None:
         frames, settings = self._frames, self._settings
@@ -91,6 +90,7 @@ class TrackingNode(ManagedNode):
     def deactivate(self) -> None:
         self.destroy_timer(self._timer)
         self._worker.close()
+        self._session.wait()
 
     def cleanup(self) -> None:
         self._models.close()
@@ -104,45 +104,45 @@ class TrackingNode(ManagedNode):
 
     def _begin(self) -> None:
         """Start with an empty map."""
-        self._session = MappingSession(self._config, self._settings.seed)
+        self._session = MappingSession(self._config, self._settings.seed, self._frames_wait)
         self._reset_requested = False
-        self._effort = MappingEffort()
         self._all_published = True
         self._path_due_s = 0.0
         self._models.begin(self._session.map_id)
         self._map_to_odom.reset()
 
+    def _begin_anew(self) -> None:
+        """Give up the map; what still trains it comes to its end first."""
+        self._session.wait()
+        self._begin()
+
+    def _frames_wait(self) -> bool:
+        return self._settings.give_way and self._worker.waiting > 0
+
     def restart(self, reason: str) -> None:
         """Begin a new map (`FrameConsumer`)."""
         self.get_logger().warn(f"{reason}; a new map begins")
-        self._begin()
+        self._begin_anew()
 
     def process(self, frame: RgbdFrame, mount: CameraMount, pair: ImagePair) -> None:
         """Track, map and publish one frame (`FrameConsumer`)."""
         if self._reset_requested:
-            self._begin()
+            self._begin_anew()
         session = self._session
         if self._paused:
             session.discarded["paused"] += 1
             self.refuse(pair, "paused")
             return
         odometry = self._odometry_of(frame, mount)
-        effort = self._effort.update(self._worker.waiting) if self._settings.adapt_effort else 1.0
-        result = session.process(frame, mount, odometry, effort)
-        head = header(frame.stamp_ns, self._frames.map_frame)
+        result = session.track(frame, mount, odometry)
         if session.has_pose:
-            T_map_base = result.T_map_camera @ session.T_camera_base
-            self._pose.publish(pose_message(T_map_base, head))
-            self._covariance.publish(
-                covariance_message(T_map_base, result.covariance, result.T_map_camera, head)
-            )
-            T_map_odom = None
-            if odometry is not None:
-                T_map_odom = result.T_map_camera @ se3.inverse(odometry.T_odom_camera)
-            self._map_to_odom.update(frame.stamp_ns, T_map_odom)
-        self._publish_status(pair, status_message(result, head))
+            self._publish_pose(result)
+        latency_s = time.monotonic() - pair.arrival_s
+        session.wait()
+        self._models.offer(session.regions, session.mapped_ns)
+        head = header(frame.stamp_ns, self._frames.map_frame)
+        self._publish_status(status_message(session.map(), head), latency_s)
         self._all_published = False
-        self._models.offer(session.regions, frame.stamp_ns)
         if time.monotonic() >= self._path_due_s:
             self._publish_path()
 
@@ -150,25 +150,25 @@ class TrackingNode(ManagedNode):
         """Tell that a pair was not tracked, and why (`FrameConsumer`)."""
         result = self._session.result
         self._publish_status(
-            pair,
             TrackingStatus(
                 header=header(pair.stamp_ns, self._frames.map_frame),
                 state=int(result.state if result else TrackingState.INITIALISING),
                 reason=reason,
             ),
+            time.monotonic() - pair.arrival_s,
         )
 
     def idle(self, silence_s: float) -> None:
         """Refine the map, then publish what the bounded rates held back (`FrameConsumer`)."""
         if self._reset_requested:
-            self._begin()
+            self._begin_anew()
         if self._all_published or silence_s < self._settings.idle_s:
             return
         if self._session.refine():
             return
         self._all_published = True
-        assert self._session.result is not None
-        self._models.offer(self._session.regions, self._session.result.stamp_ns, final=True)
+        self._session.wait()
+        self._models.offer(self._session.regions, self._session.mapped_ns, final=True)
         self._publish_path()
         if not self._models.flush(FLUSHING_S):
             self.get_logger().warn("the last region models are still being encoded")
@@ -192,7 +192,20 @@ class TrackingNode(ManagedNode):
             )
         return odometry
 
-    def _publish_status(self, pair: ImagePair, status: TrackingStatus) -> None:
+    def _publish_pose(self, result: FrameResult) -> None:
+        head = header(result.stamp_ns, self._frames.map_frame)
+        T_map_camera, odometry = result.T_map_camera, result.odometry
+        T_map_base = T_map_camera @ self._session.T_camera_base
+        self._pose.publish(pose_message(T_map_base, head))
+        self._covariance.publish(
+            covariance_message(T_map_base, result.covariance, T_map_camera, head)
+        )
+        T_map_odom = None
+        if odometry is not None:
+            T_map_odom = T_map_camera @ se3.inverse(odometry.T_odom_camera)
+        self._map_to_odom.update(result.stamp_ns, T_map_odom)
+
+    def _publish_status(self, status: TrackingStatus, latency_s: float) -> None:
         """Add what the node counts to what is known of a frame, and publish it."""
         session = self._session
         dropped = self._worker.dropped + session.discarded
@@ -201,7 +214,7 @@ class TrackingNode(ManagedNode):
         status.working_region = session.working_region
         status.training_regions = [RegionIndex(index=i) for i in session.training_regions]
         status.map_bytes = self._models.map_bytes
-        status.latency_s = time.monotonic() - pair.arrival_s
+        status.latency_s = latency_s
         status.frames_tracked = session.tracked
         status.frames_dropped = dropped.total()
         status.frames_received = session.received + dropped.total()

@@ -49,7 +49,7 @@ LIBRARIES = ("open3d-cpu", "gtsam", "torch", "numpy")
 METHODS = {
     "meslam": "MeSLAM",
     "tsdf": "TSDF SLAM (Open3D)",
-    "pose_graph": "RGB-D odometry and pose graph (Open3D, GTSAM)",
+    "pose_graph": "pose graph (Open3D, GTSAM)",
 }
 # The peers may have settings of their own for a camera; MeSLAM has the same for all.
 SETTINGS = {"tsdf": tsdf_slam.SETTINGS, "pose_graph": pose_graph_slam.SETTINGS}

@@ -18,6 +18,8 @@ from matplotlib import pyplot as plt
 
 COLORS = {"meslam": "tab:blue", "tsdf": "tab:orange", "pose_graph": "tab:green"}
 CENTIMETRES = 100.0
+# Bars end here; their labels tell the error of a method that is lost.
+HIGHEST_BAR_CM = 12.0
 
 
 @dataclass(frozen=True)
@@ -89,11 +91,13 @@ def plot(
     """Above the paths of each recording seen from above, below the errors of all methods."""
     columns = len(paths)
     figure = plt.figure(figsize=(5.5 * columns, 10), layout="constrained")
-    grid = figure.add_gridspec(2, columns, height_ratios=[3, 2])
+    grid = figure.add_gridspec(2, columns, height_ratios=[1, 1])
     for column, (recording, methods) in enumerate(paths.items()):
         axis = figure.add_subplot(grid[0, column])
         _draw_paths(axis, methods, names)
         axis.set_title(recording)
+        if not column:
+            figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     _draw_errors(figure.add_subplot(grid[1, :]), summary, names)
     figure.savefig(target, dpi=110)
     plt.close(figure)
@@ -119,7 +123,6 @@ def _draw_paths(axis: Any, methods: Mapping[str, Path3d], names: Mapping[str, st
     axis.set_xlim(true[:, across].min() - margin, true[:, across].max() + margin)
     axis.set_ylim(true[:, up].min() - margin, true[:, up].max() + margin)
     axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]", aspect="equal")
-    axis.legend(loc="best", fontsize="small")
 
 
 def _draw_errors(
@@ -134,18 +137,19 @@ def _draw_errors(
             medians = np.array([CENTIMETRES * each[key]["median"] for each in figures])
             low = medians - [CENTIMETRES * each[key]["min"] for each in figures]
             high = [CENTIMETRES * each[key]["max"] for each in figures] - medians
+            shown_cm = np.minimum(medians, HIGHEST_BAR_CM)
             bars = axis.bar(
                 np.array(shown) + (2 * number + half - len(methods) + 0.5) * width,
-                medians,
+                shown_cm,
                 width,
-                yerr=[low, high],
+                yerr=np.where(medians > HIGHEST_BAR_CM, 0.0, [low, high]),
                 capsize=3,
                 color=COLORS[method],
                 alpha=1.0 if half == 0 else 0.5,
                 label=f"{names[method]}, {label}",
             )
-            axis.bar_label(bars, fmt="%.1f", padding=2, fontsize="small")
+            axis.bar_label(bars, [f"{cm:.2f}" for cm in medians], padding=2, fontsize="small")
     axis.set_xticks(range(len(summary)), list(summary))
-    axis.set(ylabel="ATE RMSE [cm]", yscale="log", title="Error: median of the runs, and range")
+    axis.set(ylabel="ATE RMSE [cm]", title="Error: median of the runs, and range")
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(fontsize="small", ncols=len(methods))

@@ -20,6 +20,7 @@ from meslam_ros.conversions import (
     from_pose,
     stamp_ns,
     to_pose,
+    to_poses,
     to_stamp,
     to_transform,
 )
@@ -139,6 +140,14 @@ def test_pose_survives_being_sent() -> None:
     transform = to_transform(T, Time(sec=5), "map", "odom")
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
     assert transform.transform.translation.z == pytest.approx(T[2, 3])
+
+
+def test_many_poses_are_the_single_ones() -> None:
+    twists = np.random.default_rng(0).uniform(-2, 2, (5, 6))
+    T = np.array([exp(twist) for twist in twists])
+    for message, single in zip(to_poses(T), T, strict=True):
+        np.testing.assert_allclose(from_pose(message), single, atol=1e-12)
+    assert to_poses(T[:0]) == []
 
 
 def test_default_pose_is_the_identity_and_nonsense_is_refused() -> None:

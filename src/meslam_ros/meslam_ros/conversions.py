@@ -9,6 +9,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 
 from meslam_core import se3
@@ -122,6 +123,19 @@ def byte_array(data: Any) -> array.array:
 def to_pose(T: se3.Pose) -> Pose:
     """A pose message of a (4, 4) pose [m]."""
     return Pose(position=_point(T), orientation=_quaternion(T))
+
+
+def to_poses(T: NDArray[np.float64]) -> list[Pose]:
+    """Pose messages of (N, 4, 4) poses [m]; much faster than one by one."""
+    if not len(T):
+        return []
+    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat()
+    return [
+        Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(
+            T[:, :3, 3].tolist(), quaternions.tolist(), strict=True
+        )
+    ]
 
 
 def from_pose(message: Pose) -> se3.Pose:

@@ -10,9 +10,11 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 
 from meslam_core.errors import MeslamError
@@ -36,6 +38,15 @@ class ManagedNode(LifecycleNode):
         self.stop: Callable[[], None] = lambda: None
         self.ended = False
         self.autostart = bool(self.declare_parameter("autostart", True).value)
+
+    def create_publisher(self, *args: Any, **options: Any) -> Publisher:
+        """A publisher without rclpy's default event handlers.
+
+        The executor looks at each handler on every turn, which costs more than the messages do.
+        They would only warn of incompatible subscribers, and those warn themselves.
+        """
+        options.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
+        return super().create_publisher(*args, **options)
 
     def configure(self) -> None:
         """Make what the node needs."""

@@ -10,7 +10,6 @@ from rclpy.node import Node
 
 from meslam_core import se3
 from meslam_ros.conversions import NANOSECONDS
-from meslam_ros.rgbd_input import STEADY
 from meslam_ros.transforms import TransformBroadcaster
 
 MAX_AHEAD_S = 0.5
@@ -19,8 +18,9 @@ MAX_AHEAD_S = 0.5
 class MapToOdom:
     """Keeps and broadcasts T_map_odom.
 
-    Stamps continue those of the images, so that they fit the odometry's whatever clock the
-    camera or recording has.
+    A thread of its own repeats it: with a timer, the executor would look at all that the node
+    listens to each time. Stamps continue those of the images, so that they fit the odometry's
+    whatever clock the camera or recording has.
 
     Args:
         node: that broadcasts.
@@ -29,14 +29,15 @@ class MapToOdom:
     """
 
     def __init__(self, node: Node, map_frame: str, odom_frame: str, rate_hz: float) -> None:
-        self._node = node
         self._map_frame = map_frame
         self._odom_frame = odom_frame
         self._period_s = 1.0 / rate_hz
         self._broadcaster = TransformBroadcaster(node)
         self._lock = threading.Lock()
         self.reset()
-        self._timer = node.create_timer(self._period_s, self._repeat, clock=STEADY)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="map to odom", daemon=True)
+        self._thread.start()
 
     def reset(self) -> None:
         """Forget the correction; nothing is sent until the next one."""
@@ -53,6 +54,10 @@ class MapToOdom:
             self._stamp_ns, self._updated_s = stamp_ns, time.monotonic()
             self._send(stamp_ns)
 
+    def _run(self) -> None:
+        while not self._closing.wait(self._period_s):
+            self._repeat()
+
     def _repeat(self) -> None:
         with self._lock:
             elapsed_s = time.monotonic() - self._updated_s
@@ -65,5 +70,6 @@ class MapToOdom:
 
     def close(self) -> None:
         """Stop sending."""
-        self._node.destroy_timer(self._timer)
+        self._closing.set()
+        self._thread.join()
         self._broadcaster.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -67,7 +68,8 @@ def describe(publishers: list[TopicEndpointInfo]) -> str:
 class MatchedSubscription:
     """A subscription that begins when a publisher is there, with the publisher's reliability.
 
-    `update` is called regularly; it subscribes, and subscribes anew when the offer changes.
+    `update` is called regularly; it subscribes, and subscribes anew when the offer changes. So it
+    needs no warning of an incompatible offer, for whose handlers the executor looks on every turn.
 
     Attributes:
         topic: full name, remapped.
@@ -100,7 +102,11 @@ class MatchedSubscription:
             self.close()
             self._reliability = reliability
             self._subscription = self._node.create_subscription(
-                self._type, self.topic, self._received, images(reliability)
+                self._type,
+                self.topic,
+                self._received,
+                images(reliability),
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             )
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ from meslam_core import se3
 from meslam_core.slam import FrameResult
 from meslam_core.trajectory import Trajectory
 from meslam_interfaces.msg import TrackingStatus
-from meslam_ros.conversions import to_pose, to_stamp
+from meslam_ros.conversions import to_pose, to_poses, to_stamp
 
 
 def header(stamp_ns: int, frame_id: str) -> Header:
@@ -48,10 +48,10 @@ def covariance_message(
 
 def path_message(trajectory: Trajectory, T_camera_base: se3.Pose, frame_id: str) -> Path:
     """The base's path from the camera's trajectory."""
-    poses = trajectory.poses @ T_camera_base
+    poses = to_poses(trajectory.poses @ T_camera_base)
     path = Path(
         poses=[
-            pose_message(pose, header(int(stamp), frame_id))
+            PoseStamped(header=header(int(stamp), frame_id), pose=pose)
             for stamp, pose in zip(trajectory.stamps_ns, poses, strict=True)
         ]
     )

@@ -143,7 +143,7 @@ class TrackingNode(ManagedNode):
         head = header(frame.stamp_ns, self._frames.map_frame)
         self._publish_status(status_message(session.map(), head), latency_s)
         self._all_published = False
-        if time.monotonic() >= self._path_due_s:
+        if time.monotonic() >= self._path_due_s and self._path.get_subscription_count():
             self._publish_path()
 
     def refuse(self, pair: ImagePair, reason: str) -> None:

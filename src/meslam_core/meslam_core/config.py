@@ -282,6 +282,9 @@ class KeyframesConfig:
         maximum=1.0,
     )
     rays: int = setting(8192, "pixels kept of a keyframe for training", minimum=256, maximum=200000)
+    links: int = setting(
+        3, "older keyframes that a new one is registered with", minimum=0, maximum=100
+    )
 
 
 @dataclass(frozen=True)

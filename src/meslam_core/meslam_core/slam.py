@@ -15,11 +15,12 @@ from meslam_core.config import MeslamConfig
 from meslam_core.field import field_device, make_field
 from meslam_core.frame import RgbdFrame
 from meslam_core.frame_result import FrameResult, TrackingState
+from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.joint_optimizer import JointOptimizer
 from meslam_core.mapping.keyframe_policy import KeyframePolicy
 from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
 from meslam_core.mapping.training_worker import Training, TrainingWorker
-from meslam_core.odometry import OdometryEstimate
+from meslam_core.odometry import OdometryEstimate, make_registrar
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
@@ -95,6 +96,10 @@ class Slam:
         self._generator = np.random.default_rng(seed)
         self._T_map_first = T_map_camera
         self._worker = TrainingWorker()
+        self._linker: CovisibilityLinker | None = None
+        if config.keyframes.links:
+            registrar = make_registrar(config.odometry, config.sensor)
+            self._linker = CovisibilityLinker(self.keyframes, registrar, config.keyframes)
         self._trained: list[Region] = []
         self._latest_training = Training()
         self._steps_owed = 0
@@ -282,20 +287,31 @@ class Slam:
             pose,
             self._sample(frame, pixels, self.policy.PIXELS),
         )
+        linked = None
         if is_keyframe:
-            self._add_keyframe(frame, pixels, pose, pending.result.odometry)
+            linked = self._add_keyframe(frame, pixels, pose, pending.result.odometry)
         current = self._sample(frame, pixels, CURRENT_FRAME_RAYS)
         mapping = self.config.mapping
         steps = mapping.keyframe_iterations if is_keyframe else mapping.iterations
         steps += min(self._steps_owed, MADE_UP_A_FRAME)
         self._look()
         self._trained = self.atlas.active
-        self._worker.start(partial(self._train, self._trained, steps, current, pose))
+        self._worker.start(partial(self._train, self._trained, steps, current, pose, linked))
         return is_keyframe
 
-    def _train(self, regions: list[Region], steps: int, current: Rays, pose: Pose) -> Training:
+    def _train(
+        self,
+        regions: list[Region],
+        steps: int,
+        current: Rays,
+        pose: Pose,
+        linked: tuple[int, RgbdFrame, Rays] | None,
+    ) -> Training:
         """Train the working region, which comes first, and the others half as long."""
         started = time.perf_counter()
+        if linked is not None and self._linker is not None:
+            for link in self._linker.link(*linked):
+                self.keyframes.add_link(link.first, link.second, link.T_first_second)
         least = self.config.mapping.min_iterations
         losses = self.optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
@@ -341,7 +357,7 @@ class Slam:
         pixels: NDArray[np.bool_],
         pose: Pose,
         odometry: OdometryEstimate | None,
-    ) -> None:
+    ) -> tuple[int, RgbdFrame, Rays]:
         """Make the frame a keyframe, linked to the last one where odometry never failed since."""
         assert self.atlas is not None
         rays = self._sample(frame, pixels, self.config.keyframes.rays)
@@ -349,4 +365,6 @@ class Slam:
         if odometry is not None and self._keyframe_odometry is not None:
             link = inverse(self._keyframe_odometry.T_odom_camera) @ odometry.T_odom_camera
         self._keyframe_odometry = odometry if odometry is not None and odometry.valid else None
-        self.atlas.add_keyframe(self.keyframes.add(frame.stamp_ns, pose, rays, link))
+        number = self.keyframes.add(frame.stamp_ns, pose, rays, link)
+        self.atlas.add_keyframe(number)
+        return number, frame, rays

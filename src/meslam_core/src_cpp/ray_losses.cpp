@@ -21,8 +21,9 @@ struct Rendered {
 // An interval's density times its length, before it is cut.
 float optical_depth(const RaySettings& settings, int samples, const float* along,
                     const float* values, int i) {
-    const float spacing = i + 1 < samples ? along[i + 1] - along[i] : settings.truncation;
-    return settings.density_scale * std::max(values[4 * i], 0.0f) * spacing;
+    // A measured ray ends: what passes through its other intervals ends in the last one.
+    if (i + 1 == samples) return 2.0f * kMaxOpticalDepth;
+    return settings.density_scale * std::max(values[4 * i], 0.0f) * (along[i + 1] - along[i]);
 }
 
 // The light that reaches the end of interval i, and the share that ends in it, go to

@@ -50,12 +50,13 @@ void sample_rays(const SamplingSettings& settings, uint64_t seed, size_t rays,
             along[s] = (static_cast<float>(s) + random.uniform()) /
                        static_cast<float>(settings.free_samples) * free_end;
         }
-        for (int s = settings.free_samples; s < samples; s += 2) {
-            float offsets[2];
-            random.normal_pair(offsets[0], offsets[1]);
-            for (int k = 0; k < 2 && s + k < samples; ++k) {
-                const float offset = s + k + 1 == samples ? std::fabs(offsets[k]) : offsets[k];
-                along[s + k] = std::max(surface + settings.surface_sigma * offset, 0.01f);
+        for (int s = settings.free_samples; s < samples; s += 4) {
+            float offsets[4];
+            random.normal_pair(offsets[0], offsets[2]);
+            offsets[1] = -offsets[0];
+            offsets[3] = -offsets[2];
+            for (int k = 0; k < 4 && s + k < samples; ++k) {
+                along[s + k] = std::max(surface + settings.surface_sigma * offsets[k], 0.01f);
             }
         }
         std::sort(along, along + samples);

@@ -64,7 +64,7 @@ def reference(
     directions.requires_grad_(True)
     points = origins[:, None] + along[..., None] * directions[:, None]
     values = network(points.reshape(-1, 3)).reshape(*along.shape, 4)
-    rendering = render(values[..., 0], values[..., 1:], along, config)
+    rendering = render(values[..., 0], values[..., 1:], along, config, opaque_end=True)
     losses = ray_losses(values[..., 0], along, rendering, distances, colors, config, MAPPING)
     total = losses.total * torch.tensor(rays.weights) if weighted else losses.total
     parameters = list(network.parameters())

@@ -81,6 +81,15 @@ def test_an_empty_ray_is_transparent():
     torch.testing.assert_close(rendering.color, torch.zeros(1, 3))
 
 
+def test_a_measured_ray_is_opaque_at_its_end():
+    along = torch.linspace(0.1, 3.0, 50)[None]
+    empty = torch.full((1, 50), -1.0)
+    rendering = render(empty, torch.ones(1, 50, 3), along, CONFIG, opaque_end=True)
+    assert float(rendering.opacity) == pytest.approx(1.0)
+    assert float(rendering.distance_m) == pytest.approx(3.0)
+    torch.testing.assert_close(rendering.color, torch.ones(1, 3))
+
+
 def test_extreme_outputs_stay_finite():
     along = torch.linspace(0.1, 3.0, 9)[None]
     field = torch.tensor([[1e4, -1e4, 3e3, 1e6, -1.0, 0.0, 1e8, 5.0, 1.0]], requires_grad=True)

@@ -44,7 +44,11 @@ def surface_level(config: FieldConfig) -> float:
 
 
 def render(
-    distance_field: torch.Tensor, color: torch.Tensor, along: torch.Tensor, config: FieldConfig
+    distance_field: torch.Tensor,
+    color: torch.Tensor,
+    along: torch.Tensor,
+    config: FieldConfig,
+    opaque_end: bool = False,
 ) -> Rendering:
     """Render rays from samples.
 
@@ -53,11 +57,17 @@ def render(
         color: (R, S, 3) in [0, 1].
         along: (R, S) ascending distances of the samples [m].
         config: density scale [1/m] and truncation [m].
+        opaque_end: what passes through the other samples ends in the last one, as light does on
+            a ray that was measured. Without it a ray whose few samples let light through is
+            rendered too dark, and training answers by drawing the surface nearer.
     """
     density = config.density_scale * torch.relu(distance_field)
     spacing = torch.diff(along, dim=1)
     spacing = torch.cat([spacing, torch.full_like(along[:, :1], config.truncation_m)], dim=1)
     optical_depth = (density * spacing).clamp(max=MAX_OPTICAL_DEPTH)
+    if opaque_end:
+        end = torch.full_like(optical_depth[:, :1], MAX_OPTICAL_DEPTH)
+        optical_depth = torch.cat([optical_depth[:, :-1], end], dim=1)
     passed = torch.cumsum(optical_depth, dim=1) - optical_depth
     weights = torch.exp(-passed) * -torch.expm1(-optical_depth)
     opacity = weights.sum(dim=1)

@@ -160,7 +160,7 @@ class TorchBatches:
         points = origins[:, None] + along[..., None] * directions[:, None]
         values = field.evaluate(self._region.to_region(points.reshape(-1, 3)))
         values = values.reshape(*along.shape, 4)
-        rendering = render(values[..., 0], values[..., 1:], along, field.config)
+        rendering = render(values[..., 0], values[..., 1:], along, field.config, opaque_end=True)
         losses = ray_losses(
             values[..., 0], along, rendering, rays.distances_m, rays.colors, field.config, config
         )

@@ -11,17 +11,18 @@ from meslam_core.odometry.keyframe_odometry import KeyframeOdometry
 from meslam_core.odometry.odometry import Odometry, OdometryEstimate
 from meslam_core.odometry.registration import ColoredIcpRegistrar, HybridRegistrar, Registrar
 
-__all__ = ["Odometry", "OdometryEstimate", "make_odometry"]
+__all__ = ["Odometry", "OdometryEstimate", "make_odometry", "make_registrar"]
 
 logger = logging.getLogger(__name__)
 
 
 def make_odometry(odometry: OdometryConfig, sensor: SensorConfig) -> Odometry:
     """The odometry that the configuration names."""
-    return KeyframeOdometry(_registrar(odometry, sensor), odometry, sensor)
+    return KeyframeOdometry(make_registrar(odometry, sensor), odometry, sensor)
 
 
-def _registrar(odometry: OdometryConfig, sensor: SensorConfig) -> Registrar:
+def make_registrar(odometry: OdometryConfig, sensor: SensorConfig) -> Registrar:
+    """The registration of images that the configuration names."""
     if odometry.method == "colored_icp":
         return ColoredIcpRegistrar(odometry, sensor)
     if odometry.method == "hybrid":

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from meslam_core import se3
 
@@ -44,6 +48,34 @@ def test_exp_is_the_matrix_exponential(twist):
     assert_same(se3.exp(twist), expm(generator), 1e-7)
 
 
+@st.composite
+def rotations(draw: st.DrawFn) -> np.ndarray:
+    """Any rotation matrix; those close to none and to half a turn included."""
+    axis = draw(vectors(-1.0, 1.0).filter(lambda v: np.linalg.norm(v) > 1e-3))
+    near = st.floats(-1e-3, 1e-3)
+    angle = draw(st.one_of(st.floats(-np.pi, np.pi), near, near.map(lambda a: np.pi - a)))
+    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+
+
+@given(rotations())
+def test_rotation_vectors_are_those_of_scipy(rotation):
+    ours, theirs = se3.rotation_vector(rotation), Rotation.from_matrix(rotation).as_rotvec()
+    if np.linalg.norm(theirs) > np.pi - 1e-6 and ours @ theirs < 0:
+        ours = -ours  # At half a turn the axis has two directions.
+    assert_same(ours, theirs)
+    assert_same(Rotation.from_rotvec(ours).as_matrix(), rotation)
+
+
+@given(rotations())
+def test_angles_and_quaternions_are_those_of_scipy(rotation):
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    theirs = Rotation.from_matrix(rotation)
+    assert se3.rotation_angle(pose) == pytest.approx(theirs.magnitude(), abs=1e-9)
+    quaternion = se3.to_quaternion(pose)
+    assert abs(quaternion @ theirs.as_quat()) == pytest.approx(1.0, abs=1e-12)
+
+
 @given(twists(), twists())
 def test_inverse_undoes_a_product(first, second):
     pose = se3.exp(first) @ se3.exp(second)
@@ -64,6 +96,20 @@ def test_orthonormalized_is_rigid_and_close(twist, noise):
     assert_same(repaired[:3, :3] @ repaired[:3, :3].T, np.eye(3))
     assert np.linalg.det(repaired[:3, :3]) > 0
     assert np.abs(repaired - pose).max() < 5e-3
+
+
+@given(rotations(), hnp.arrays(np.float64, (3, 3), elements=st.floats(-1.0, 1.0)))
+@pytest.mark.parametrize("size", [1e-9, 1e-6, 4e-6, 1e-4])
+def test_orthonormalized_is_the_closest_rotation(size, rotation, noise):
+    pose = np.eye(4)
+    pose[:3, :3] = rotation + size * noise
+    u, _, vt = np.linalg.svd(pose[:3, :3])
+    assert_same(se3.orthonormalized(pose)[:3, :3], u @ vt, 1e-13)
+
+
+def test_orthonormalized_makes_no_mirror_image():
+    repaired = se3.orthonormalized(np.diag([1.0, 1.0, -1.0, 1.0]))
+    assert np.linalg.det(repaired[:3, :3]) == pytest.approx(1.0)
 
 
 @given(twists(), twists(), st.floats(0.0, 1.0))
@@ -88,6 +134,11 @@ def test_rotation_angle_is_the_length_of_the_rotation_vector(twist):
 def test_half_a_turn_survives_the_round_trip():
     pose = se3.exp(np.array([1.0, 2.0, 3.0, 0.0, np.pi, 0.0]))
     assert_same(se3.exp(se3.log(pose)), pose)
+
+
+def test_poses_need_no_torch():
+    code = "import sys, meslam_core.se3; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_hat_is_the_cross_product():

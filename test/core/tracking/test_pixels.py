@@ -7,7 +7,13 @@ import pytest
 from data.textured_room import frame_at, path
 
 from meslam_core.config import SensorConfig
-from meslam_core.tracking.pixels import choose_pixels, trusted_pixels, usable_share
+from meslam_core.tracking.pixels import (
+    BAND_PIXELS,
+    TrustedPixels,
+    choose_pixels,
+    trusted_pixels,
+    usable_share,
+)
 
 CONFIG = SensorConfig()
 
@@ -43,6 +49,55 @@ def test_a_slanted_surface_is_no_edge():
 
 def test_an_image_without_depth_has_no_trusted_pixel():
     assert not trusted_pixels(np.zeros((10, 10), np.float32), CONFIG).any()
+
+
+def test_the_limits_of_the_range_belong_to_it():
+    depth = np.full((20, 20), CONFIG.min_depth_m, np.float32)
+    depth[10:] = CONFIG.max_depth_m
+    trusted = trusted_pixels(depth, CONFIG)
+    assert trusted[:9].all()
+    assert trusted[11:].all()
+    depth[:10] = np.nextafter(np.float32(CONFIG.min_depth_m), np.float32(0.0))
+    depth[10:] = np.nextafter(np.float32(CONFIG.max_depth_m), np.float32(9.0))
+    assert not trusted_pixels(depth, CONFIG).any()
+
+
+@pytest.mark.parametrize("hole", [np.nan, np.inf, -np.inf, -1.0])
+def test_numbers_that_are_no_depth_are_holes(hole):
+    depth = np.full((20, 20), 2.0, np.float32)
+    depth[4:9, 4:9] = hole
+    expected = np.ones((20, 20), bool)
+    expected[4:9, 4:9] = False
+    np.testing.assert_array_equal(trusted_pixels(depth, CONFIG), expected)
+
+
+def test_every_pixel_is_judged_by_all_its_neighbours():
+    # Larger than what is gone through at once, so that neighbours lie in other parts of it.
+    generator = np.random.default_rng(0)
+    depth = generator.uniform(1.0, 1.06, (BAND_PIXELS // 100, 250)).astype(np.float32)
+    depth[generator.uniform(size=depth.shape) < 0.3] = 0.0
+    around = np.pad(depth, 1)
+    stack = np.lib.stride_tricks.sliding_window_view(around, (3, 3)).reshape(*depth.shape, 9)
+    span = stack.max(2) - np.where(stack > 0, stack, 9.0).min(2)
+    expected = (depth > 0) & (span < CONFIG.edge_threshold * depth)
+    assert 0.2 < expected.mean() < 0.8
+    np.testing.assert_array_equal(trusted_pixels(depth, CONFIG), expected)
+
+
+def test_pixels_are_counted():
+    mask = np.zeros((30, 40), bool)
+    mask[3:5, 4:7] = True
+    assert len(TrustedPixels(mask)) == 6
+
+
+def test_one_may_choose_several_times():
+    mask = np.zeros((30, 40), bool)
+    mask[5:20, 7:33] = True
+    pixels, generator = TrustedPixels(mask), np.random.default_rng(0)
+    first, second = (np.array(pixels.choose(100, generator)) for _ in range(2))
+    assert not np.array_equal(first, second)
+    assert mask[tuple(first)].all()
+    assert mask[tuple(second)].all()
 
 
 def test_chosen_pixels_are_distinct_and_trusted():

@@ -257,7 +257,8 @@ class NeuralMapper:
         self.config = config
         started = time.process_time()
         generator = np.random.default_rng(seed)
-        store = KeyframeStore(config.keyframes.rays, field_device(config.field))
+        kept = config.keyframes
+        store = KeyframeStore(kept.rays, field_device(config.field), kept.ray_budget, seed)
         position = scene.keyframes[0].T_map_camera[:3, 3]
         self.atlas = RegionAtlas(config, position, store, seed)
         for view in scene.keyframes:

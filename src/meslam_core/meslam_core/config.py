@@ -282,6 +282,13 @@ class KeyframesConfig:
         maximum=1.0,
     )
     rays: int = setting(8192, "pixels kept of a keyframe for training", minimum=256, maximum=200000)
+    ray_budget: int = setting(
+        128 * 8192,
+        "pixels kept of all keyframes; with more keyframes each keeps fewer",
+        unit="rays",
+        minimum=4096,
+        maximum=1_000_000_000,
+    )
     links: int = setting(
         3, "older keyframes that a new one is registered with", minimum=0, maximum=100
     )

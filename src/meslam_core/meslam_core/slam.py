@@ -85,7 +85,8 @@ class Slam:
     ) -> None:
         self.config = config
         self.device = field_device(config.field)
-        self.keyframes = KeyframeStore(config.keyframes.rays, self.device)
+        kept = config.keyframes
+        self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed)
         self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
         self.policy = KeyframePolicy(config.keyframes, config.field)
         self.tracking = FrameTracking(config.tracking)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from data.textured_room import frame_at
 
+from meslam_core.field.rendering import render
 from meslam_core.mapping.keyframe_policy import KeyframePolicy
 from meslam_core.mapping.keyframes import rays_at
 from meslam_core.se3 import Pose, exp
@@ -59,3 +61,20 @@ def test_lost_overlap_makes_one_before_the_motion_is_large(is_keyframe, referenc
 def test_a_scene_that_changed_makes_one(is_keyframe, reference):
     # Everything is half a metre farther than the map says.
     assert is_keyframe(reference, offset_m=0.5)
+
+
+@pytest.mark.parametrize("number", [5, 25])
+def test_distances_are_those_of_the_volume_rendering(mapped_room, number):
+    frame, pose = mapped_room.frame(number), mapped_room.poses[number]
+    rows, columns = np.mgrid[4:120:11, 4:160:11].reshape(2, -1)
+    rays = rays_at(frame, rows, columns)
+    policy = KeyframePolicy(mapped_room.config.keyframes, mapped_room.config.field)
+    along = torch.linspace(0.05, 5.0, 2000).expand(len(rays), -1)
+    rotation, centre = (torch.from_numpy(part).float() for part in (pose[:3, :3], pose[:3, 3]))
+    points = centre + along[..., None] * (rays.directions @ rotation.T)[:, None]
+    inputs = mapped_room.region.to_region(points.reshape(-1, 3)).numpy()
+    values = torch.from_numpy(mapped_room.region.field.predict(inputs)).reshape(*along.shape, 4)
+    dense = render(values[..., 0], values[..., 1:], along, mapped_room.config.field)
+    error = policy.rendered_distances(mapped_room.region, pose, rays) - dense.distance_m.numpy()
+    assert np.median(np.abs(error)) < 0.005
+    assert np.mean(np.abs(error) < 0.03) > 0.95

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.config import FieldConfig, KeyframesConfig
-from meslam_core.field.rendering import render
+from meslam_core.field.rendering import MAX_OPTICAL_DEPTH
 from meslam_core.mapping.keyframes import KeyframeStore, Rays
 from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, rotation_angle
 
+Floats = NDArray[np.float32]
+
+NEAREST_M = 0.05
 COARSE_SAMPLES = 24
 FINE_SAMPLES = 8
+# A rendered ray costs as much as many projected points; this share of them decides as surely.
+RENDERED_EVERY = 2
 
 
 class KeyframePolicy:
@@ -50,7 +55,9 @@ class KeyframePolicy:
             return True
         if self._overlap(camera, offset, rays) < self.config.overlap:
             return True
-        return self._agreement(region, T_map_camera, rays) < self.config.agreement
+        some = slice(None, None, RENDERED_EVERY)
+        rendered = Rays(rays.directions[some], rays.distances_m[some], rays.colors[some])
+        return self._agreement(region, T_map_camera, rendered) < self.config.agreement
 
     def _overlap(self, camera: PinholeCamera, T_reference_camera: Pose, rays: Rays) -> float:
         """Share of the points that project into the reference keyframe's image."""
@@ -66,26 +73,45 @@ class KeyframePolicy:
         error = np.abs(rendered - rays.distances_m.numpy()) / rays.distances_m.numpy()
         return float(np.mean(error < self.config.agreement_tolerance))
 
-    def rendered_distances(self, region: Region, T_map_camera: Pose, rays: Rays) -> np.ndarray:
+    def rendered_distances(self, region: Region, T_map_camera: Pose, rays: Rays) -> Floats:
         """Rendered distances (R,) along rays [m]; samples reach past the farthest measurement."""
-        count = len(rays)
         far = 1.2 * float(rays.distances_m.max())
-        along = torch.linspace(0.05, far, COARSE_SAMPLES).expand(count, -1)
-        values = self._values(region, T_map_camera, rays, along)
-        behind = values[..., 0] > 0
-        first = torch.where(behind.any(1), behind.float().argmax(1), COARSE_SAMPLES - 1)
-        hit = along.gather(1, first[:, None])
+        coarse = np.linspace(NEAREST_M, far, COARSE_SAMPLES, dtype=np.float32)
+        coarse = np.tile(coarse, (len(rays), 1))
+        values = _distance_field(region, T_map_camera, rays, coarse)
+        behind = values > 0.0
+        behind[:, -1] = True
+        hit = np.take_along_axis(coarse, behind.argmax(1)[:, None], 1)
         spacing = far / COARSE_SAMPLES
-        fine = hit + torch.linspace(-spacing, spacing / 2, FINE_SAMPLES)
-        along = torch.cat([along, fine.clamp(min=0.01)], dim=1).sort(dim=1).values
-        values = self._values(region, T_map_camera, rays, along)
-        return render(values[..., 0], values[..., 1:], along, self.field).distance_m.numpy()
+        fine = hit + np.linspace(-spacing, spacing / 2, FINE_SAMPLES, dtype=np.float32)
+        fine = np.maximum(fine, np.float32(0.01))
+        along = np.concatenate([coarse, fine], axis=1)
+        values = np.concatenate([values, _distance_field(region, T_map_camera, rays, fine)], axis=1)
+        order = along.argsort(axis=1)
+        along = np.take_along_axis(along, order, 1)
+        return self._expected_distance(np.take_along_axis(values, order, 1), along)
 
-    def _values(
-        self, region: Region, T_map_camera: Pose, rays: Rays, along: torch.Tensor
-    ) -> torch.Tensor:
-        pose = torch.from_numpy(T_map_camera).float()
-        directions = rays.directions @ pose[:3, :3].T
-        points = pose[:3, 3] + along[..., None] * directions[:, None]
-        inputs = region.to_region(points.reshape(-1, 3)).contiguous().numpy()
-        return torch.from_numpy(region.field.predict(inputs)).reshape(*along.shape, 4)
+    def _expected_distance(self, distance_field: Floats, along: Floats) -> Floats:
+        """The distance (R,) of `field.rendering.render`, without a graph to learn from."""
+        field = self.field
+        last = np.full_like(along[:, :1], field.truncation_m)
+        optical_depth = np.maximum(distance_field, np.float32(0.0)) * np.diff(
+            along, append=along[:, -1:] + last
+        )
+        optical_depth = np.minimum(field.density_scale * optical_depth, MAX_OPTICAL_DEPTH)
+        passed = np.cumsum(optical_depth, axis=1) - optical_depth
+        weights = np.exp(-passed) * -np.expm1(-optical_depth)
+        opacity = np.maximum(weights.sum(axis=1), 1e-4)
+        distance: Floats = (weights * along).sum(axis=1) / opacity
+        return distance
+
+
+def _distance_field(region: Region, T_map_camera: Pose, rays: Rays, along: Floats) -> Floats:
+    """f (R, S) at distances (R, S) along rays [m]."""
+    # Composed before it meets the points: far from the map's origin single precision is coarse.
+    T_region_camera = inverse(region.T_map_region) @ T_map_camera / region.half_side_m
+    origin = T_region_camera[:3, 3].astype(np.float32)
+    directions = rays.directions.numpy() @ T_region_camera[:3, :3].T.astype(np.float32)
+    points = origin + along[..., None] * directions[:, None]
+    values = region.field.predict(points.reshape(-1, 3))
+    return values[:, 0].reshape(along.shape)

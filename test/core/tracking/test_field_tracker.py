@@ -105,6 +105,34 @@ def test_the_robust_cost_prefers_the_better_guess(mapped_room):
     assert 0.0 <= costs[0] < 0.2
 
 
+def test_the_best_guess_comes_first(mapped_room):
+    rays, true = rays_of(mapped_room, 5), mapped_room.poses[5]
+    guesses = [disturbed(true, 0.01 * k, 0.5 * k, 2) for k in (3, 0, 2, 1)]
+    ranked = TRACKER.ranked(mapped_room.region, rays, guesses)
+    for pose, best in zip(ranked, [1, 3, 2, 0], strict=True):
+        np.testing.assert_array_equal(pose, guesses[best])
+
+
+def test_of_guesses_that_agree_only_the_first_is_kept(mapped_room):
+    rays, true = rays_of(mapped_room, 5), mapped_room.poses[5]
+    guesses = [true, disturbed(true, 0.0005, 0.02, 0), disturbed(true, 0.0, 0.02, 1)]
+    assert len(TRACKER.ranked(mapped_room.region, rays, guesses)) == 1
+    assert TRACKER.ranked(mapped_room.region, rays, guesses)[0] is true
+    turned = disturbed(true, 0.0, 0.2, 1)
+    assert len(TRACKER.ranked(mapped_room.region, rays, [*guesses, turned])) == 2
+
+
+def test_statistics_are_those_of_the_pose_that_was_found(mapped_room):
+    rays = rays_of(mapped_room, 5)
+    guess = disturbed(mapped_room.poses[5], 0.02, 1.0, 3)
+    found = TRACKER.align(mapped_room.region, rays, guess)
+    again = TRACKER.align(mapped_room.region, rays, found.T_map_camera)
+    assert found.converged
+    assert found.residual_m == pytest.approx(again.residual_m, abs=3e-4)
+    assert found.inlier_ratio == pytest.approx(again.inlier_ratio, abs=0.01)
+    assert found.observed_ratio == pytest.approx(again.observed_ratio, abs=0.01)
+
+
 def test_the_information_is_symmetric_and_tells_well_seen_directions(mapped_room):
     result = TRACKER.align(mapped_room.region, rays_of(mapped_room, 5), mapped_room.poses[5])
     information = result.information

@@ -74,7 +74,7 @@ def test_numbers_that_are_no_depth_are_holes(hole):
 def test_every_pixel_is_judged_by_all_its_neighbours():
     # Larger than what is gone through at once, so that neighbours lie in other parts of it.
     generator = np.random.default_rng(0)
-    depth = generator.uniform(1.0, 1.06, (BAND_PIXELS // 100, 250)).astype(np.float32)
+    depth = generator.uniform(1.0, 1.06, (BAND_PIXELS // 60, 250)).astype(np.float32)
     depth[generator.uniform(size=depth.shape) < 0.3] = 0.0
     around = np.pad(depth, 1)
     stack = np.lib.stride_tricks.sliding_window_view(around, (3, 3)).reshape(*depth.shape, 9)

@@ -8,11 +8,11 @@ registration (Park et al. 2017).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from meslam_core.config import TrackingConfig
 from meslam_core.field.alignment import AlignmentSettings, NormalEquations
@@ -20,7 +20,14 @@ from meslam_core.field.model import LUMA
 from meslam_core.field.rendering import surface_level
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.regions.region import Region
-from meslam_core.se3 import Pose, exp, inverse, orthonormalized
+from meslam_core.se3 import (
+    Pose,
+    exp,
+    inverse,
+    orthonormalized,
+    rotation_angle,
+    rotation_vector,
+)
 from meslam_core.tracking.field_equations import field_equations
 
 Floats = NDArray[np.float32]
@@ -32,6 +39,13 @@ MIN_SLOPE = 1.0
 MIN_SPREAD_M = 0.003
 MAX_SPREAD_M = 0.05
 MIN_POINTS = 30
+# The first steps bring a pose near, for which about so many points suffice.
+COARSE_STEPS = 2
+COARSE_POINTS = 500
+# First guesses are told apart by about so many points, if they are farther apart than this.
+RANKING_POINTS = 400
+SAME_DISTANCE_M = 0.001
+SAME_ANGLE_RAD = float(np.deg2rad(0.05))
 
 
 @dataclass(frozen=True)
@@ -71,8 +85,7 @@ class PosePrior:
 
     def deviation(self, T_map_camera: Pose) -> NDArray[np.float64]:
         """How a pose differs from the mean (6,): (translation [m], rotation [rad]), map axes."""
-        turned = T_map_camera[:3, :3] @ self.T_map_camera[:3, :3].T
-        rotation = Rotation.from_matrix(turned).as_rotvec()
+        rotation = rotation_vector(T_map_camera[:3, :3] @ self.T_map_camera[:3, :3].T)
         return np.concatenate([T_map_camera[:3, 3] - self.T_map_camera[:3, 3], rotation])
 
 
@@ -90,6 +103,9 @@ class _Measured:
     luma: Floats
     confidence: Floats
 
+    def __len__(self) -> int:
+        return len(self.luma)
+
     @classmethod
     def of(cls, rays: Rays) -> _Measured:
         depth = rays.distances_m.numpy()
@@ -98,6 +114,14 @@ class _Measured:
             luma=rays.colors.numpy() @ np.array(LUMA, np.float32),
             confidence=np.minimum(1.5, 1.0 / (0.5 + 0.125 * depth**2)).astype(np.float32),
         )
+
+    def some(self, count: int) -> _Measured:
+        """About `count` of the points, evenly chosen; all where there are fewer."""
+        stride = max(1, len(self) // count)
+        if stride == 1:
+            return self
+        parts = (self.ends, self.luma, self.confidence)
+        return _Measured(*(np.ascontiguousarray(part[::stride]) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -133,25 +157,30 @@ class FieldTracker:
             prior: keeps the pose where geometry leaves it free, and smooth.
         """
         measured = _Measured.of(rays)
+        coarse = measured.some(COARSE_POINTS)
         pose = T_map_camera.copy()
         converged = False
         iteration = 0
         information = np.zeros((6, 6))
         for iteration in range(1, self.config.iterations + 1):
-            fit = self._fit(region, measured, pose, self._huber(iteration))
-            if len(fit.errors_m) < MIN_POINTS:
+            points = coarse if iteration <= COARSE_STEPS else measured
+            fit = self._fit(region, points, pose, self._huber(iteration))
+            share = len(points) / max(len(measured), 1)
+            if len(fit.errors_m) < MIN_POINTS * share:
                 break
-            information, step = self._solve(fit, pose, prior)
+            information, step = self._solve(fit, pose, prior, share)
             if not np.isfinite(step).all():
                 break
             motion = exp(np.concatenate([np.zeros(3), step[3:]]))
             pose[:3, :3] = motion[:3, :3] @ pose[:3, :3]
             pose[:3, 3] += step[:3]
-            if np.linalg.norm(step[:3]) + np.linalg.norm(step[3:]) < self.config.convergence:
+            length = np.linalg.norm(step[:3]) + np.linalg.norm(step[3:])
+            if points is measured and length < self.config.convergence:
                 converged = True
                 break
         pose = orthonormalized(pose)
-        fit = self._fit(region, measured, pose)
+        if not converged:
+            fit = self._fit(region, measured, pose)
         inliers = int(np.count_nonzero(fit.errors_m < self.config.inlier_distance_m))
         return Alignment(
             T_map_camera=pose,
@@ -163,16 +192,36 @@ class FieldTracker:
             converged=converged,
         )
 
+    def ranked(self, region: Region, rays: Rays, guesses: Sequence[Pose]) -> list[Pose]:
+        """First guesses of a frame's pose, the best first; of those that agree only the first.
+
+        Args:
+            region: the working region.
+            rays: of the frame, camera frame.
+            guesses: (4, 4) T_map_camera each.
+        """
+        distinct: list[Pose] = []
+        for guess in guesses:
+            if not any(_agree(guess, other) for other in distinct):
+                distinct.append(guess)
+        if len(distinct) < 2:
+            return distinct
+        points = _Measured.of(rays).some(RANKING_POINTS)
+        return sorted(distinct, key=lambda guess: self._robust_cost(region, points, guess))
+
     def robust_cost(self, region: Region, rays: Rays, T_map_camera: Pose) -> float:
-        """Mean Geman-McClure cost in [0, 1] of a pose; compares first guesses."""
-        errors = self._fit(region, _Measured.of(rays), T_map_camera).errors_m
+        """Mean Geman-McClure cost in [0, 1] of a pose, from some of the rays."""
+        return self._robust_cost(region, _Measured.of(rays).some(RANKING_POINTS), T_map_camera)
+
+    def _robust_cost(self, region: Region, measured: _Measured, pose: Pose) -> float:
+        errors = self._fit(region, measured, pose).errors_m
         squared = (errors / self.config.huber_narrow_m) ** 2
-        unusable = len(rays) - len(errors)
-        return float((np.sum(squared / (1.0 + squared)) + unusable) / max(len(rays), 1))
+        unusable = len(measured) - len(errors)
+        return float((np.sum(squared / (1.0 + squared)) + unusable) / max(len(measured), 1))
 
     def _huber(self, iteration: int) -> float:
-        """The robust threshold narrows geometrically over the first four steps."""
-        progress = min(1.0, (iteration - 1) / 3.0)
+        """The robust threshold narrows geometrically until all points are used."""
+        progress = min(1.0, (iteration - 1) / COARSE_STEPS)
         wide, narrow = self.config.huber_wide_m, self.config.huber_narrow_m
         return float(wide * (narrow / wide) ** progress)
 
@@ -206,12 +255,15 @@ class FieldTracker:
         return _Fit(equations, int(np.count_nonzero(observed)), errors)
 
     def _solve(
-        self, fit: _Fit, pose: Pose, prior: PosePrior | None
+        self, fit: _Fit, pose: Pose, prior: PosePrior | None, share: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Information (6, 6) and step (6,) of one iteratively reweighted step."""
+        """Information (6, 6) and step (6,) of one iteratively reweighted step.
+
+        A share of the points stands for all of them, or the prior would weigh more.
+        """
         # Neighbouring points err alike, in the depth image as in the map.
         sigma = _spread(fit.errors_m)
-        scale = 1.0 / (sigma**2 * self.config.points_per_observation)
+        scale = 1.0 / (sigma**2 * self.config.points_per_observation * share)
         information = fit.equations.information * scale
         gradient = fit.equations.gradient * scale
         if prior is not None:
@@ -225,3 +277,12 @@ class FieldTracker:
 def _spread(errors_m: Floats) -> float:
     """Standard deviation [m] of residuals, from their median so that outliers do not count."""
     return float(np.clip(1.4826 * np.median(errors_m), MIN_SPREAD_M, MAX_SPREAD_M))
+
+
+def _agree(first: Pose, second: Pose) -> bool:
+    """Whether two poses are so close that there is nothing to choose."""
+    distance = np.linalg.norm(first[:3, 3] - second[:3, 3])
+    return bool(
+        distance < SAME_DISTANCE_M
+        and rotation_angle(first[:3, :3].T @ second[:3, :3]) < SAME_ANGLE_RAD
+    )

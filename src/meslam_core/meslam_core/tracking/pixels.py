@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from meslam_core.config import SensorConfig
 from meslam_core.frame import RgbdFrame
 
-# Images are gone through in bands of so many pixels: memory for larger ones comes from the
-# system anew for every frame, which takes longer than what is computed in it.
-BAND_PIXELS = 80_000
+# Images are gone through in bands of so many pixels, in the same memory: more of it would come
+# from the system anew for every frame, which takes longer than what is computed in it.
+BAND_PIXELS = 25_000
+# Stands for holes where the nearest depth is sought.
 NO_DEPTH = 1e9
 NEIGHBOURS = np.ones((3, 3), np.uint8)
 
@@ -46,32 +47,38 @@ def trusted_pixels(depth_m: NDArray[np.float32], config: SensorConfig) -> NDArra
     A pixel lies on an edge when the depth within its 3x3 neighbourhood, holes left out, spans
     more than `edge_threshold` of its own.
     """
+    depth_m = np.asarray(depth_m, np.float32)
     height, width = depth_m.shape
     rows = max(1, BAND_PIXELS // max(width, 1))
     trusted = np.empty(depth_m.shape, np.bool_)
+    scratch = np.empty((4, rows + 2, width), np.float32)
     for first in range(0, height, rows):
-        above = max(first - 1, 0)
-        band = _trusted_band(depth_m[above : first + rows + 1], config)
-        trusted[first : first + rows] = band[first - above :][:rows]
+        above, end = max(first - 1, 0), min(first + rows, height)
+        band = depth_m[above : end + 1]
+        span, limit = _spans(band, config, scratch[:, : len(band)])
+        inner = slice(first - above, end - above)
+        np.less(span[inner], limit[inner], out=trusted[first:end])
     return trusted
 
 
-def _trusted_band(depth_m: NDArray[np.float32], config: SensorConfig) -> NDArray[np.bool_]:
-    """`trusted_pixels` of some rows."""
+def _spans(
+    depth_m: NDArray[np.float32], config: SensorConfig, scratch: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """How far depth spans about the pixels of some rows, and what it may; in `scratch`."""
+    valid, filled, farthest, limit = scratch
     # OpenCV's limit is exclusive.
     below = float(np.nextafter(np.float32(config.min_depth_m), np.float32(0.0)))
-    valid = cv2.threshold(depth_m, below, 0.0, cv2.THRESH_TOZERO)[1]
+    cv2.threshold(depth_m, below, 0.0, cv2.THRESH_TOZERO, dst=valid)
     cv2.threshold(valid, config.max_depth_m, 0.0, cv2.THRESH_TOZERO_INV, dst=valid)
     cv2.patchNaNs(valid, 0.0)
-    limit = valid * np.float32(config.edge_threshold)
-    farthest = cv2.dilate(valid, NEIGHBOURS)
-    filled = cv2.threshold(valid, 0.0, NO_DEPTH, cv2.THRESH_BINARY_INV)[1]
+    np.multiply(valid, np.float32(config.edge_threshold), out=limit)
+    cv2.dilate(valid, NEIGHBOURS, dst=farthest)
+    cv2.threshold(valid, 0.0, NO_DEPTH, cv2.THRESH_BINARY_INV, dst=filled)
     cv2.max(filled, valid, dst=filled)
     nearest = cv2.erode(filled, NEIGHBOURS, dst=valid)
-    # Where a pixel has no depth the limit is 0, and no span is below it.
-    span = cv2.absdiff(farthest, nearest, dst=farthest)
-    band: NDArray[np.bool_] = span < limit
-    return band
+    # Where a pixel has no depth its limit is 0, and no span is below it.
+    cv2.absdiff(farthest, nearest, dst=farthest)
+    return farthest, limit
 
 
 def choose_pixels(

@@ -213,23 +213,23 @@ class TrackingConfig:
         0.15, "weight of the colour residual (0 switches it off)", minimum=0.0, maximum=10.0
     )
     points_per_observation: float = setting(
-        50.0,
+        400.0,
         "points that err together, and count as one observation against odometry",
         minimum=1.0,
         maximum=100000.0,
     )
     odometry_sigma_m: float = setting(
-        0.004, "error of odometry from frame to frame", unit="m", minimum=1e-5, maximum=1.0
+        0.001, "error of odometry from frame to frame", unit="m", minimum=1e-5, maximum=1.0
     )
     odometry_sigma_deg: float = setting(
-        0.2,
+        0.05,
         "error of odometry's rotation from frame to frame",
         unit="deg",
         minimum=1e-4,
         maximum=45.0,
     )
     odometry_drift: float = setting(
-        0.03, "further error of odometry, as a share of the motion", minimum=0.0, maximum=1.0
+        0.01, "further error of odometry, as a share of the motion", minimum=0.0, maximum=1.0
     )
     min_inlier_ratio: float = setting(
         0.35, "share of inliers below which a pose is not trusted", minimum=0.0, maximum=1.0
@@ -270,10 +270,10 @@ class KeyframesConfig:
         0.1, "relative depth error up to which a pixel agrees", minimum=0.001, maximum=1.0
     )
     translation_m: float = setting(
-        0.20, "or when it moved this far from its reference", unit="m", minimum=0.01, maximum=5.0
+        0.10, "or when it moved this far from its reference", unit="m", minimum=0.01, maximum=5.0
     )
     rotation_deg: float = setting(
-        15.0, "or turned this much", unit="deg", minimum=0.5, maximum=180.0
+        8.0, "or turned this much", unit="deg", minimum=0.5, maximum=180.0
     )
     overlap: float = setting(
         0.75,
@@ -290,7 +290,7 @@ class KeyframesConfig:
         maximum=1_000_000_000,
     )
     links: int = setting(
-        3, "older keyframes that a new one is registered with", minimum=0, maximum=100
+        5, "older keyframes that a new one is registered with", minimum=0, maximum=100
     )
 
 
@@ -298,25 +298,25 @@ class KeyframesConfig:
 class MappingConfig:
     """Joint optimisation of weights and poses (Sec. II-B)."""
 
-    rays: int = setting(600, "rays of keyframes in a step", minimum=8, maximum=20000)
+    rays: int = setting(400, "rays of keyframes in a step", minimum=8, maximum=20000)
     current_rays: int = setting(
         150, "rays of the current frame in a step", minimum=0, maximum=20000
     )
-    free_samples: int = setting(5, "samples of a ray in free space", minimum=1, maximum=64)
+    free_samples: int = setting(4, "samples of a ray in free space", minimum=1, maximum=64)
     surface_samples: int = setting(4, "samples of a ray near the surface", minimum=1, maximum=64)
     surface_sigma_m: float = setting(
-        0.04, "spread of the samples near the surface", unit="m", minimum=0.005, maximum=0.5
+        0.03, "spread of the samples near the surface", unit="m", minimum=0.005, maximum=0.5
     )
     first_iterations: int = setting(300, "steps on the first frame", minimum=1, maximum=10000)
-    iterations: int = setting(24, "steps a frame", minimum=0, maximum=1000)
+    iterations: int = setting(16, "steps a frame", minimum=0, maximum=1000)
     min_iterations: int = setting(
         6, "steps a frame even while frames wait to be tracked", minimum=0, maximum=1000
     )
-    keyframe_iterations: int = setting(60, "steps on a new keyframe", minimum=0, maximum=1000)
+    keyframe_iterations: int = setting(30, "steps on a new keyframe", minimum=0, maximum=1000)
     final_iterations: int = setting(
         4000, "steps after the last frame of a recording", minimum=0, maximum=100000
     )
-    learning_rate: float = setting(4e-3, "Adam's step for the weights", minimum=1e-6, maximum=0.1)
+    learning_rate: float = setting(8e-3, "Adam's step for the weights", minimum=1e-6, maximum=0.1)
     pose_learning_rate: float = setting(
         2e-3, "Adam's step for keyframe poses", unit="m, rad", minimum=0.0, maximum=0.1
     )
@@ -336,7 +336,7 @@ class MappingConfig:
         1.0, "weight of the rendered-colour loss", minimum=0.0, maximum=100.0
     )
     odometry_weight: float = setting(
-        50.0,
+        2000.0,
         "weight of odometry between consecutive keyframes (squared error)",
         unit="1/m^2, 1/rad^2",
         minimum=0.0,

@@ -20,7 +20,7 @@ from meslam_core.mapping.joint_optimizer import JointOptimizer
 from meslam_core.mapping.keyframe_policy import KeyframePolicy
 from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
 from meslam_core.mapping.training_worker import Training, TrainingWorker
-from meslam_core.odometry import OdometryEstimate, make_registrar
+from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
@@ -41,6 +41,8 @@ MIN_FRAME_PIXELS = 200
 # frames make up for the rest, so many steps each.
 FIRST_STEPS_SHARE = 0.4
 MADE_UP_A_FRAME = 40
+# Odometry ties a keyframe to the one before; a registration of the two says it better.
+ODOMETRY_LINK_WEIGHT = 0.1
 # A refinement comes in portions of so many steps, the last at this share of the learning rate.
 REFINING_STEPS = 50
 LAST_RATE_FACTOR = 0.05
@@ -99,8 +101,7 @@ class Slam:
         self._worker = TrainingWorker()
         self._linker: CovisibilityLinker | None = None
         if config.keyframes.links:
-            registrar = make_registrar(config.odometry, config.sensor)
-            self._linker = CovisibilityLinker(self.keyframes, registrar, config.keyframes)
+            self._linker = CovisibilityLinker(self.keyframes, config)
         self._trained: list[Region] = []
         self._latest_training = Training()
         self._steps_owed = 0
@@ -366,6 +367,8 @@ class Slam:
         if odometry is not None and self._keyframe_odometry is not None:
             link = inverse(self._keyframe_odometry.T_odom_camera) @ odometry.T_odom_camera
         self._keyframe_odometry = odometry if odometry is not None and odometry.valid else None
-        number = self.keyframes.add(frame.stamp_ns, pose, rays, link)
+        number = self.keyframes.add(frame.stamp_ns, pose, rays)
+        if link is not None:
+            self.keyframes.add_link(number - 1, number, link, ODOMETRY_LINK_WEIGHT)
         self.atlas.add_keyframe(number)
         return number, frame, rays

@@ -25,7 +25,7 @@ def shares(draws: list[RayDraws], keyframes: int) -> np.ndarray:
 
 
 def test_rays_come_mostly_from_keyframes_that_fit_badly():
-    share = shares([drawn(np.array([0.01, 1.0, 0.01, 0.01, 0.01]), steps=100)], 5)
+    share = shares([drawn(np.array([0.01, 1.0, 0.01, 0.01, 0.01]), steps=100, current=9)], 5)
     # Square roots of the losses: 10 against four times 1.
     assert share[1] == pytest.approx(0.8 * 10 / 14, abs=0.02)
     assert share[4] == pytest.approx(0.2 + 0.8 / 14, abs=0.02)
@@ -33,7 +33,7 @@ def test_rays_come_mostly_from_keyframes_that_fit_badly():
 
 def test_the_latest_keyframe_is_the_last_member_whatever_its_number():
     draws = draw_rays(
-        np.random.default_rng(0), CONFIG, 10, np.array([3, 9, 5]), np.ones(3, np.float32), 64, 0
+        np.random.default_rng(0), CONFIG, 10, np.array([3, 9, 5]), np.ones(3, np.float32), 64, 9
     )
     numbers = draws.keyframes[draws.chosen]
     assert np.bincount(numbers.reshape(-1)).argmax() == 5
@@ -43,7 +43,7 @@ def test_the_latest_keyframe_is_the_last_member_whatever_its_number():
 def test_of_many_keyframes_each_comes_as_often_as_its_loss_asks():
     count = 3 * MOST_KEYFRAMES
     losses = np.random.default_rng(5).uniform(0.1, 2.0, count)
-    draws = [drawn(losses, steps=5, seed=seed) for seed in range(150)]
+    draws = [drawn(losses, steps=5, seed=seed, current=9) for seed in range(150)]
     for draw in draws:
         assert len(draw.keyframes) <= MOST_KEYFRAMES
         assert draw.keyframes[-1] == 10 + count - 1
@@ -66,8 +66,10 @@ def test_indices_fit_what_they_index():
     assert len(set(draws.seeds.tolist())) == 20
 
 
-def test_no_current_frame_no_current_rays():
-    assert drawn(np.ones(4)).current_slots.shape == (20, 0)
+def test_no_current_frame_no_current_rays_and_no_keyframe_before_the_others():
+    draws = drawn(np.ones(4), steps=100)
+    assert draws.current_slots.shape == (100, 0)
+    assert shares([draws], 4) == pytest.approx(np.full(4, 0.25), abs=0.01)
 
 
 def test_the_generator_decides():

@@ -47,7 +47,7 @@ def draw_rays(
     rays_per_keyframe: int,
     current_rays: int,
 ) -> RayDraws:
-    """Some rays of each step from the latest keyframe, the rest by the root of the loss.
+    """Rays by the root of their keyframe's loss; beside a current frame some of the latest one.
 
     Args:
         generator: of every choice.
@@ -64,7 +64,8 @@ def draw_rays(
         members, weights = _representatives(generator, members, weights)
     order = np.argsort(members)
     keyframes, weights = members[order], weights[order]
-    latest = round(config.rays * config.latest_share)
+    # The latest keyframe stands for where the camera is: nowhere, when no frame is current.
+    latest = round(config.rays * config.latest_share) if current_rays else 0
     chosen = np.empty((steps, config.rays), np.int64)
     ladder = np.cumsum(weights)
     heights = generator.random((steps, config.rays - latest)) * ladder[-1]

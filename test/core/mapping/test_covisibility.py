@@ -17,6 +17,7 @@ from meslam_core.mapping.covisibility import DEPTH_UNIT_M, CovisibilityLinker, K
 from meslam_core.mapping.keyframes import KeyframeStore, rays_at
 from meslam_core.odometry.registration import Registration
 from meslam_core.se3 import Pose, exp, inverse, log
+from meslam_core.tracking.pixels import choose_pixels
 
 LARGE = CAMERA.scaled(2.0)
 START = path(1)[0]
@@ -38,13 +39,13 @@ class Mapper:
         config = MeslamConfig.from_overrides(["keyframes.rays=512", *overrides])
         self.keyframes = KeyframeStore(config.keyframes.rays, torch.device("cpu"))
         self.linker = CovisibilityLinker(self.keyframes, config)
+        self._generator = np.random.default_rng(0)
 
     def add(self, pose: Pose, believed: Pose | None = None):
         """Links of the view from a pose, of which the store believes another."""
         number = len(self.keyframes)
         frame = frame_at(pose, number, LARGE)
-        rows, columns = np.indices(frame.depth_m.shape)[:, ::10, ::15].reshape(2, -1)
-        rays = rays_at(frame, rows, columns)
+        rays = rays_at(frame, *choose_pixels(frame.depth_m > 0, 512, self._generator))
         self.keyframes.add(frame.stamp_ns, pose if believed is None else believed, rays)
         return self.linker.link(number, frame, rays)
 
@@ -136,7 +137,7 @@ def test_keyframes_that_look_elsewhere_are_not_tied():
 def test_a_keyframe_gets_no_more_links_than_configured(limit):
     mapper = Mapper(f"keyframes.links={limit}")
     # Aside: the farther away, the less of the view is shared.
-    poses = [START @ exp(np.array([0.03 * n, 0.0, 0.0, 0.0, 0.0, 0.0])) for n in range(6)]
+    poses = [START @ exp(np.array([0.06 * n, 0.0, 0.0, 0.0, 0.0, 0.0])) for n in range(6)]
     mapper.add_all(poses[:5])
     links = mapper.add(poses[5])
     assert len(links) == limit

@@ -153,10 +153,10 @@ def test_a_believed_pose_far_from_what_the_images_show_is_not_tied():
 
 
 IMPLAUSIBLE = {
-    "far away": {"T_target_source": exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))},
-    "turned": {"T_target_source": exp(np.array([0.0, 0.0, 0.0, 0.0, 0.2, 0.0]))},
-    "few points": {"fitness": 0.5},
-    "other colours": {"agreement": 0.3},
+    "far away": {"T_target_source": exp(1.1 * covisibility.MAX_CORRECTION_M * np.eye(6)[0])},
+    "turned": {"T_target_source": exp(1.1 * covisibility.MAX_CORRECTION_RAD * np.eye(6)[4])},
+    "few points": {"fitness": 0.9 * covisibility.MIN_FITNESS},
+    "other colours": {"agreement": 0.9 * covisibility.MIN_AGREEMENT},
 }
 
 

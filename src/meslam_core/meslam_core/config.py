@@ -213,7 +213,7 @@ class TrackingConfig:
         0.15, "weight of the colour residual (0 switches it off)", minimum=0.0, maximum=10.0
     )
     points_per_observation: float = setting(
-        400.0,
+        1500.0,
         "points that err together, and count as one observation against odometry",
         minimum=1.0,
         maximum=100000.0,

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from meslam_core.config import MeslamConfig
 from meslam_core.field import field_device, make_field
@@ -26,7 +25,7 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.frame_history import KeyframePoses
 from meslam_core.tracking.frame_tracking import FrameTracking, TrackedPose
-from meslam_core.tracking.pixels import choose_pixels, trusted_pixels
+from meslam_core.tracking.pixels import TrustedPixels, trusted_pixels
 from meslam_core.trajectory import Trajectory
 
 __all__ = ["FrameResult", "Slam", "TrackingState"]
@@ -42,7 +41,7 @@ MIN_FRAME_PIXELS = 200
 FIRST_STEPS_SHARE = 0.4
 MADE_UP_A_FRAME = 40
 # Odometry ties a keyframe to the one before; a registration of the two says it better.
-ODOMETRY_LINK_WEIGHT = 0.1
+ODOMETRY_LINK_WEIGHT = 0.05
 # A refinement comes in portions of so many steps, the last at this share of the learning rate.
 REFINING_STEPS = 50
 LAST_RATE_FACTOR = 0.05
@@ -53,7 +52,7 @@ class _Pending:
     """A tracked frame that the map has not seen yet."""
 
     frame: RgbdFrame
-    pixels: NDArray[np.bool_]
+    pixels: TrustedPixels
     tracked: TrackedPose
     result: FrameResult
     reference: int
@@ -134,8 +133,8 @@ class Slam:
             odometry: its external odometry; without one, the last motion is continued.
         """
         started = time.perf_counter()
-        pixels = trusted_pixels(frame.depth_m, self.config.sensor)
-        enough = np.count_nonzero(pixels) >= MIN_FRAME_PIXELS
+        pixels = TrustedPixels(trusted_pixels(frame.depth_m, self.config.sensor))
+        enough = len(pixels) >= MIN_FRAME_PIXELS
         if self._view is not None:
             rays = self._sample(frame, pixels, self.config.tracking.points) if enough else None
             tracked = self.tracking.track(frame.stamp_ns, self._view, rays, odometry)
@@ -194,6 +193,8 @@ class Slam:
     def _remember(self, pending: _Pending, is_keyframe: bool) -> None:
         reference, relative = pending.reference, pending.T_reference_camera
         if is_keyframe:
+            if len(self._history):
+                self._history.hand_over(reference, relative)
             reference, relative = len(self.keyframes) - 1, np.eye(4)
         result = pending.result
         self._history.add(
@@ -251,8 +252,8 @@ class Slam:
         """T_map_camera of every frame as it was known when the frame was done."""
         return self._history.online_trajectory()
 
-    def _sample(self, frame: RgbdFrame, pixels: NDArray[np.bool_], count: int) -> Rays:
-        return rays_at(frame, *choose_pixels(pixels, count, self._generator))
+    def _sample(self, frame: RgbdFrame, pixels: TrustedPixels, count: int) -> Rays:
+        return rays_at(frame, *pixels.choose(count, self._generator))
 
     def _finish_training(self) -> Training:
         """Wait for the training that runs, and let tracking see what it did."""
@@ -356,7 +357,7 @@ class Slam:
     def _add_keyframe(
         self,
         frame: RgbdFrame,
-        pixels: NDArray[np.bool_],
+        pixels: TrustedPixels,
         pose: Pose,
         odometry: OdometryEstimate | None,
     ) -> tuple[int, RgbdFrame, Rays]:

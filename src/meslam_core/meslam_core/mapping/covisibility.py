@@ -6,8 +6,9 @@ again what an older one saw is registered with it directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -23,8 +24,9 @@ from meslam_core.se3 import Pose, inverse, rotation_angle
 # Points of the new keyframe by which an overlap is judged.
 JUDGED_POINTS = 64
 MIN_OVERLAP = 0.5
-MIN_FITNESS = 0.7
-MIN_AGREEMENT = 0.45
+ATTEMPTS_A_LINK = 2
+MIN_FITNESS = 0.6
+MIN_AGREEMENT = 0.3
 # A registration farther from where the keyframes are believed to be is not believed itself.
 MAX_CORRECTION_M = 0.15
 MAX_CORRECTION_RAD = 0.12
@@ -133,18 +135,27 @@ class CovisibilityLinker:
             frame: its images; they are kept for keyframes to come.
             rays: its sample, camera frame.
         """
-        links: list[CovisibilityLink] = []
         image = KeyframeImage.of(frame, self._width)
-        prepared = self._registrar.prepare(image.frame())
-        for older in self._candidates(keyframe, frame.camera, rays):
-            if len(links) >= self._links:
-                break
-            T_older_new = self._register(older, keyframe, prepared)
-            if T_older_new is not None:
-                links.append(CovisibilityLink(older, keyframe, T_older_new))
+        older = islice(
+            self._candidates(keyframe, frame.camera, rays), ATTEMPTS_A_LINK * self._links
+        )
+        links = self._register_all(keyframe, image, older)
         self._images[keyframe] = image
         if len(self._images) > MAX_IMAGES:
             self._forget_one()
+        return links
+
+    def _register_all(
+        self, keyframe: int, image: KeyframeImage, others: Iterable[int]
+    ) -> list[CovisibilityLink]:
+        links: list[CovisibilityLink] = []
+        prepared = self._registrar.prepare(image.frame())
+        for other in others:
+            if len(links) >= self._links:
+                break
+            T_other_keyframe = self._register(other, keyframe, prepared)
+            if T_other_keyframe is not None:
+                links.append(CovisibilityLink(other, keyframe, T_other_keyframe))
         return links
 
     def _register(self, older: int, keyframe: int, prepared: object) -> Pose | None:
@@ -163,7 +174,7 @@ class CovisibilityLinker:
         return None if far or turned else found.T_target_source
 
     def _candidates(self, keyframe: int, camera: PinholeCamera, rays: Rays) -> Iterator[int]:
-        """Older keyframes that share the view, those that share most and the oldest in turn."""
+        """Keyframes that share the view: those that share most and the oldest in turn."""
         pose = self._keyframes.pose(keyframe)
         step = max(1, len(rays) // JUDGED_POINTS)
         points = (rays.directions[::step] * rays.distances_m[::step, None]).numpy()
@@ -180,8 +191,8 @@ class CovisibilityLinker:
         seen = numbers[overlap > MIN_OVERLAP]
         best = numbers[np.argsort(-overlap, kind="stable")][: len(seen)]
         given: set[int] = set()
-        for pair in zip(best, np.sort(seen), strict=True):
-            for number in pair:
+        for two in zip(best, np.sort(seen), strict=True):
+            for number in two:
                 if int(number) not in given:
                     given.add(int(number))
                     yield int(number)

@@ -71,6 +71,8 @@ class FrameHistory:
         self._relative = np.zeros((64, 4, 4))
         self._online = np.zeros((64, 4, 4))
         self._measured: deque[_Measured] = deque(maxlen=MAX_ODOMETRY_GAP)
+        # By keyframe: how the next one was tracked in it, and when.
+        self._handovers: dict[int, tuple[Pose, int]] = {}
 
     def __len__(self) -> int:
         return self._count
@@ -103,6 +105,10 @@ class FrameHistory:
         if odometry is not None:
             self._measured.append(_Measured(self._count, odometry))
         self._count += 1
+
+    def hand_over(self, reference: int, T_reference_next: Pose) -> None:
+        """The next frame becomes a keyframe: how it was tracked in the one before, (4, 4)."""
+        self._handovers[reference] = (T_reference_next, self._count)
 
     @property
     def newest_keyframe(self) -> int:
@@ -146,13 +152,36 @@ class FrameHistory:
         return self.pose(last.number), motion
 
     def trajectory(self) -> Trajectory:
-        """T_map_camera of every frame as it is known now."""
+        """T_map_camera of every frame as it is known now.
+
+        A frame between two keyframes was tracked in both: in the first directly, in the second
+        through how that one was tracked. Where refinement moved them apart, it moves from the one
+        to the other in the course of time.
+        """
+        stamps = self._stamps_ns[: self._count]
         poses = np.zeros((0, 4, 4))
         if self._count:
             assert self.keyframes is not None
-            references = self._references[: self._count]
-            poses = self.keyframes.compose(references, self._relative[: self._count])
-        return Trajectory(self._stamps_ns[: self._count].copy(), poses)
+            poses = self.keyframes.compose(
+                self._references[: self._count], self._relative[: self._count]
+            )
+        starts = np.flatnonzero(np.diff(self._references[: self._count], prepend=-1))
+        for start in starts:
+            reference = int(self._references[start])
+            if reference not in self._handovers:
+                continue
+            T_reference_next, end = self._handovers[reference]
+            if end >= self._count:
+                continue
+            T_map_next = self.keyframe_pose(int(self._references[end]))
+            T_next_reference = inverse(T_reference_next)
+            duration = max(int(stamps[end] - stamps[start]), 1)
+            for number in range(start + 1, end):
+                through_next = T_map_next @ T_next_reference @ self._relative[number]
+                apart = log(orthonormalized(inverse(poses[number]) @ through_next))
+                share = (stamps[number] - stamps[start]) / duration
+                poses[number] = poses[number] @ exp(share * apart)
+        return Trajectory(stamps.copy(), poses)
 
     def online_trajectory(self) -> Trajectory:
         """T_map_camera of every frame as it was known when the frame was done."""

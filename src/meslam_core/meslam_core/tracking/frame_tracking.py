@@ -108,11 +108,10 @@ class FrameTracking:
     ) -> Alignment:
         """The best alignment with a region from all first guesses that are worth trying."""
         guesses = self._guesses(stamp_ns, odometry)
-        costs = [self._tracker.robust_cost(region, rays, guess) for guess in guesses]
         prior = self._prior(odometry)
         alignments: list[Alignment] = []
-        for index in np.argsort(costs):
-            alignments.append(self._tracker.align(region, rays, guesses[index], prior))
+        for guess in self._tracker.ranked(region, rays, guesses):
+            alignments.append(self._tracker.align(region, rays, guess, prior))
             if alignments[-1].inlier_ratio > CONFIDENT_INLIERS:
                 break
         return max(alignments, key=lambda alignment: alignment.inlier_ratio)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from meslam_core.config import Setting
+from meslam_core.setting import Setting
 from meslam_ros import node_settings
 from meslam_ros.parameters import node_settings as entries_of
 

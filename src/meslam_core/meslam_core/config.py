@@ -9,78 +9,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import yaml
 
 from meslam_core.errors import ConfigError
-
-T = TypeVar("T", int, float, bool, str)
-
-
-def setting(
-    default: T,
-    meaning: str,
-    *,
-    unit: str = "",
-    minimum: float | None = None,
-    maximum: float | None = None,
-    choices: tuple[str, ...] = (),
-) -> T:
-    """A dataclass field that carries its unit, range and meaning."""
-    metadata = {
-        "meaning": meaning,
-        "unit": unit,
-        "minimum": minimum,
-        "maximum": maximum,
-        "choices": choices,
-    }
-    return dataclasses.field(default=default, metadata=metadata)
-
-
-@dataclass(frozen=True)
-class Setting:
-    """One number of the configuration with everything known about it."""
-
-    section: str
-    name: str
-    default: int | float | bool | str
-    meaning: str
-    unit: str
-    minimum: float | None
-    maximum: float | None
-    choices: tuple[str, ...]
-
-    @property
-    def path(self) -> str:
-        """`section.name`, as in `--set` and in ROS parameters."""
-        return f"{self.section}.{self.name}" if self.section else self.name
-
-    def checked(self, value: Any) -> int | float | bool | str:
-        """`value` in the setting's type.
-
-        Raises:
-            ConfigError: when the type is wrong or the value out of range.
-        """
-        kind: Any = type(self.default)
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if type(value) is not kind:
-            raise ConfigError(
-                f"{self.path} = {value!r} is {type(value).__name__}, expected {kind.__name__}"
-            )
-        if self.choices and value not in self.choices:
-            raise ConfigError(f"{self.path} = {value!r}; choose one of {', '.join(self.choices)}")
-        if not self._in_range(value):
-            raise ConfigError(
-                f"{self.path} = {value} is outside [{self.minimum}, {self.maximum}] {self.unit}"
-            )
-        return cast("int | float | bool | str", value)
-
-    def _in_range(self, value: Any) -> bool:
-        """Whether a value keeps the limits; not-a-number keeps none."""
-        low = self.minimum is None or value >= self.minimum
-        return low and (self.maximum is None or value <= self.maximum)
+from meslam_core.setting import Setting, setting
 
 
 @dataclass(frozen=True)
@@ -337,7 +271,7 @@ class MappingConfig:
     )
     odometry_weight: float = setting(
         2000.0,
-        "weight of odometry between consecutive keyframes (squared error)",
+        "weight of the measured motions between keyframes (squared error)",
         unit="1/m^2, 1/rad^2",
         minimum=0.0,
         maximum=1e6,

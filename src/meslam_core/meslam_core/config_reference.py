@@ -15,7 +15,8 @@ from pathlib import Path
 
 import yaml
 
-from meslam_core.config import PRESETS, MeslamConfig, Setting, settings
+from meslam_core.config import PRESETS, MeslamConfig, settings
+from meslam_core.setting import Setting
 
 COMMAND = "python -m meslam_core.config_reference"
 LINE_LENGTH = 96

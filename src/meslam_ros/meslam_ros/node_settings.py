@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from meslam_core.config import setting
+from meslam_core.setting import setting
 
 
 @dataclass(frozen=True)

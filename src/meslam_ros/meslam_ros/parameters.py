@@ -14,8 +14,9 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-from meslam_core.config import MeslamConfig, Setting, settings
+from meslam_core.config import MeslamConfig, settings
 from meslam_core.errors import ConfigError
+from meslam_core.setting import Setting
 
 S = TypeVar("S")
 

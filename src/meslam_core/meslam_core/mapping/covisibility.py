@@ -30,8 +30,6 @@ MIN_AGREEMENT = 0.3
 # A registration farther from where the keyframes are believed to be is not believed itself.
 MAX_CORRECTION_M = 0.15
 MAX_CORRECTION_RAD = 0.12
-
-
 # Images of more keyframes are not kept: of the two most alike, the older ones go.
 MAX_IMAGES = 200
 # An angle of 1 rad makes views as different as this distance does [m].
@@ -205,7 +203,5 @@ class CovisibilityLinker:
         apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
         apart += RADIAN_AS_M * np.linalg.norm(axes[:, None] - axes[None], axis=2)
         apart[np.tril_indices(len(numbers))] = np.inf
-        # The newest serves the keyframes that come next.
-        apart[:, -1] = np.inf
         older, _ = np.unravel_index(np.argmin(apart), apart.shape)
         del self._images[int(numbers[older])]

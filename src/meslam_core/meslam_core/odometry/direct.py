@@ -1,9 +1,8 @@
 """Direct RGB-D alignment in compiled code: the default registration.
 
 Photometric and point-to-plane residuals on an image pyramid, weighted by t-distributions whose
-scales are estimated (Kerl et al. 2013), with gain and offset of the light. Five times faster than
-Open3D's hybrid method at the same resolution, because pyramids, gradients and normals are made
-once a frame and not once a pair.
+scales are estimated (Kerl et al. 2013), with gain and offset of the light. Pyramids, gradients and
+normals are made once a frame, not once a pair.
 """
 
 from __future__ import annotations

@@ -128,6 +128,14 @@ def run(
         Path | None, typer.Option(help="True poses (TUM format) to compare with.")
     ] = None,
     lever_arm: LeverArmOption = False,
+    odometry: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="POSES.txt",
+            help="Poses of the camera from elsewhere (TUM format, in any frame) instead of the "
+            "built-in odometry.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of every random choice.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -150,7 +158,9 @@ def run(
     from meslam_core.recordings import open_recording
 
     source = open_recording(recording, intrinsics)
-    options = pipeline.RunOptions(chosen, realtime, truth, lever_arm, seed)
+    options = pipeline.RunOptions(
+        chosen, realtime, truth, hand_eye=lever_arm, odometry=odometry, seed=seed
+    )
     try:
         with RunBar(error_console()) as bar:
             outcome = pipeline.run(source, config, out, options, bar)

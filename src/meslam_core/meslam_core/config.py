@@ -43,8 +43,9 @@ class OdometryConfig:
         "direct",
         "'direct': compiled alignment with photometric and geometric terms; "
         "'hybrid': Open3D's RGB-D odometry with both; "
-        "'colored_icp': coloured point-cloud registration as in the paper",
-        choices=("direct", "hybrid", "colored_icp"),
+        "'colored_icp': coloured point-cloud registration as in the paper; "
+        "'none': no odometry, tracking continues the last motion",
+        choices=("direct", "hybrid", "colored_icp", "none"),
     )
     image_width: int = setting(
         320, "images are reduced to at most this width", unit="px", minimum=80, maximum=1920
@@ -94,6 +95,36 @@ class OdometryConfig:
     )
     max_turn_deg_s: float = setting(
         300.0, "faster turning is not believed", unit="deg/s", minimum=10.0, maximum=3000.0
+    )
+    given_sigma_m: float = setting(
+        0.002,
+        "error of odometry from elsewhere (wheels, a tracking camera) from frame to frame",
+        unit="m",
+        minimum=1e-5,
+        maximum=1.0,
+    )
+    given_sigma_deg: float = setting(
+        0.1, "the same of the rotation", unit="deg", minimum=1e-4, maximum=45.0
+    )
+    given_drift: float = setting(
+        0.02,
+        "further error of odometry from elsewhere, as a share of the motion",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    given_drift_deg_m: float = setting(
+        1.0,
+        "further error of its rotation with the distance travelled",
+        unit="deg/m",
+        minimum=0.0,
+        maximum=90.0,
+    )
+    given_gap_s: float = setting(
+        0.2,
+        "its poses are not interpolated between two that are farther apart",
+        unit="s",
+        minimum=0.001,
+        maximum=60.0,
     )
 
 
@@ -310,6 +341,13 @@ class RegionsConfig:
         minimum=1.0,
         maximum=6.0,
     )
+    initialisation: str = setting(
+        "continued",
+        "how a new region's network begins: 'continued': the working region's map goes on in it, "
+        "exactly; 'copied': the weights as they are, as in the paper; 'random': from nothing",
+        choices=("continued", "copied", "random"),
+    )
+    single: bool = setting(False, "one network for everything: no region is made but the first")
 
 
 @dataclass(frozen=True)
@@ -335,6 +373,9 @@ class RuntimeConfig:
     threads: int = setting(1, "threads of one tensor operation on the CPU", minimum=1, maximum=256)
     queue: int = setting(
         4, "frames that odometry may be ahead of tracking", unit="frames", minimum=1, maximum=1000
+    )
+    work_dir: str = setting(
+        "", "folder for regions at rest while mapping; empty: the system's temporary folder"
     )
 
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any, Protocol
 
 from meslam_core.config import MeslamConfig
 from meslam_core.errors import EvaluationError, FrameError, RecordingError
 from meslam_core.evaluation.report import truth_entries
+from meslam_core.interruption import stop_request
 from meslam_core.map.store import MapStore
 from meslam_core.map.stored_region import snapshot
-from meslam_core.odometry import make_odometry
+from meslam_core.odometry import GivenOdometry, make_odometry
 from meslam_core.odometry_worker import OdometryWorker
 from meslam_core.pacing import PacedFrames
 from meslam_core.recordings.recording import Recording
@@ -67,6 +65,8 @@ class RunOptions:
             one is in work (see `PacedFrames`).
         truth: poses in TUM format to compare with.
         hand_eye: the truth is the pose of another sensor on the same mount; find its place too.
+        odometry: poses of the camera in TUM format, in any frame, that take the place of the
+            built-in odometry.
         seed: of every random choice.
     """
 
@@ -74,6 +74,7 @@ class RunOptions:
     realtime: bool = False
     truth: Path | None = None
     hand_eye: bool = False
+    odometry: Path | None = None
     seed: int = 0
 
 
@@ -119,14 +120,16 @@ def run(
 
     Raises:
         OutputError: when `out_dir` cannot be written; known before the first frame.
-        EvaluationError: when the truth cannot be read; known before the first frame.
+        EvaluationError: when the truth or the odometry cannot be read; known before the first
+            frame.
         RecordingError, FrameError: when not a single frame can be read.
     """
     options, progress = options or RunOptions(), progress or Silent()
     limit_threads(config.runtime.threads)
     truth = None if options.truth is None else read_tum(options.truth)
+    odometry = None if options.odometry is None else read_tum(options.odometry)
     with ResultFolder(out_dir) as results:
-        loop = _Loop(recording, config, options, progress)
+        loop = _Loop(recording, config, options, odometry, progress)
         loop.run()
         slam = loop.slam
         progress.stage("writing")
@@ -164,6 +167,7 @@ class _Loop:
         recording: Recording,
         config: MeslamConfig,
         options: RunOptions,
+        odometry: Trajectory | None,
         progress: RunProgress,
     ) -> None:
         self.tally = Tally()
@@ -177,12 +181,13 @@ class _Loop:
         self._recording = recording
         self._worker: OdometryWorker | None = None
         self._options = options
+        self._odometry = odometry
         self._progress = progress
 
     def run(self) -> None:
         """Feed the frames, then refine the map unless the user is in a hurry."""
         started = time.perf_counter()
-        with _stop_request() as stop:
+        with stop_request() as stop:
             try:
                 self._feed(stop)
             except (RecordingError, FrameError) as error:
@@ -203,7 +208,11 @@ class _Loop:
     def _feed(self, stop: threading.Event) -> None:
         chosen, config = self._options.frames, self._config
         self._progress.started(len(range(*chosen.indices(len(self._recording)))))
-        odometry = make_odometry(config.odometry, config.sensor)
+        odometry = (
+            make_odometry(config.odometry, config.sensor)
+            if self._odometry is None
+            else GivenOdometry(self._odometry, config.odometry)
+        )
         frames = self._recording.frames(chosen.start or 0, chosen.stop, chosen.step or 1)
         paced = PacedFrames(frames) if self._options.realtime else None
         self._worker = OdometryWorker(paced or frames, odometry, config.runtime.queue)
@@ -243,31 +252,6 @@ class _Loop:
             "realtime": self._options.realtime,
             "config": self._config.to_mapping(),
         }
-
-
-@contextmanager
-def _stop_request() -> Iterator[threading.Event]:
-    """An event that the first SIGINT or SIGTERM sets; the second one has its usual effect."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    usual: dict[int, Any] = {}
-
-    def restore() -> None:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
-
-    def request(_: int, __: FrameType | None) -> None:
-        event.set()
-        restore()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        usual[number] = signal.signal(number, request)
-    try:
-        yield event
-    finally:
-        restore()
 
 
 def _write_map(slam: Slam, stamp_ns: int, path: Path) -> int:

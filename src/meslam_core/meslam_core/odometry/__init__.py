@@ -7,17 +7,28 @@ import logging
 from meslam_core.config import OdometryConfig, SensorConfig
 from meslam_core.odometry import direct
 from meslam_core.odometry.direct import DirectRegistrar
+from meslam_core.odometry.given_odometry import GivenOdometry, NoOdometry, given_noise
 from meslam_core.odometry.keyframe_odometry import KeyframeOdometry
-from meslam_core.odometry.odometry import Odometry, OdometryEstimate
+from meslam_core.odometry.odometry import MotionNoise, Odometry, OdometryEstimate
 from meslam_core.odometry.registration import ColoredIcpRegistrar, HybridRegistrar, Registrar
 
-__all__ = ["Odometry", "OdometryEstimate", "make_odometry", "make_registrar"]
+__all__ = [
+    "GivenOdometry",
+    "MotionNoise",
+    "Odometry",
+    "OdometryEstimate",
+    "given_noise",
+    "make_odometry",
+    "make_registrar",
+]
 
 logger = logging.getLogger(__name__)
 
 
 def make_odometry(odometry: OdometryConfig, sensor: SensorConfig) -> Odometry:
     """The odometry that the configuration names."""
+    if odometry.method == "none":
+        return NoOdometry()
     return KeyframeOdometry(make_registrar(odometry, sensor), odometry, sensor)
 
 

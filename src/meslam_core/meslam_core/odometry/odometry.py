@@ -9,7 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meslam_core.frame import RgbdFrame
-from meslam_core.se3 import Pose
+from meslam_core.se3 import Pose, rotation_angle
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """How far a measured motion may be wrong: one standard deviation.
+
+    Attributes:
+        distance_m: of the distance, however short the motion [m].
+        angle_rad: of the angle, likewise [rad].
+        drift: further error of both, as a share of each.
+        drift_rad_m: further error of the angle with the distance travelled [rad/m].
+    """
+
+    distance_m: float
+    angle_rad: float
+    drift: float
+    drift_rad_m: float = 0.0
+
+    def deviations(self, motion: Pose) -> tuple[float, float]:
+        """Error of the distance [m] and of the angle [rad] of a motion (4, 4)."""
+        distance = float(np.linalg.norm(motion[:3, 3]))
+        angle = self.angle_rad + self.drift * rotation_angle(motion) + self.drift_rad_m * distance
+        return self.distance_m + self.drift * distance, angle
 
 
 @dataclass(frozen=True)
@@ -25,6 +48,9 @@ class OdometryEstimate:
         valid: whether the registration passed its checks; an invalid one continues the last
             motion and must not be trusted.
         reason: why it is invalid, empty otherwise.
+        noise: of odometry from elsewhere, any two valid estimates of which tell a motion, whatever
+            came between. None for what is registered here from frame to frame: the motion from or
+            to an invalid estimate is a guess, and `TrackingConfig` says how the others err.
     """
 
     stamp_ns: int
@@ -34,6 +60,7 @@ class OdometryEstimate:
     residual_m: float
     valid: bool
     reason: str = ""
+    noise: MotionNoise | None = None
 
 
 class Odometry(Protocol):

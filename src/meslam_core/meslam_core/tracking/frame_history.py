@@ -102,7 +102,7 @@ class FrameHistory:
         self._references[self._count] = reference
         self._relative[self._count] = T_keyframe_camera
         self._online[self._count] = T_map_camera
-        if odometry is not None:
+        if odometry is not None and (odometry.valid or odometry.noise is None):
             self._measured.append(_Measured(self._count, odometry))
         self._count += 1
 

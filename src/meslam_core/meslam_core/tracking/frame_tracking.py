@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from meslam_core.config import TrackingConfig
 from meslam_core.frame_result import TrackingState
 from meslam_core.mapping.keyframes import Rays
-from meslam_core.odometry import OdometryEstimate
+from meslam_core.odometry import MotionNoise, OdometryEstimate
 from meslam_core.regions.region import Region
-from meslam_core.se3 import Pose, orthonormalized, rotation_angle
+from meslam_core.se3 import Pose, orthonormalized
 from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.frame_history import FrameHistory
 
@@ -66,6 +66,7 @@ class FrameTracking:
         self.history = FrameHistory()
         self.state = TrackingState.INITIALISING
         self._tracker = FieldTracker(config)
+        self._noise = registered_noise(config)
         self._untrusted = 0
         self._covariance = np.eye(6) * FIRST_VARIANCE
 
@@ -122,11 +123,8 @@ class FrameTracking:
         if moved is None:
             return None
         T_map_last, motion = moved
-        distance = float(np.linalg.norm(motion[:3, 3]))
-        sigma_m = self.config.odometry_sigma_m + self.config.odometry_drift * distance
-        sigma_rad = np.deg2rad(self.config.odometry_sigma_deg)
-        sigma_rad += self.config.odometry_drift * rotation_angle(motion)
-        variances = np.repeat([sigma_m**2, sigma_rad**2], 3)
+        noise = (odometry.noise if odometry else None) or self._noise
+        variances = np.repeat(np.square(noise.deviations(motion)), 3)
         covariance = self._covariance + np.diag(variances)
         return PosePrior(orthonormalized(T_map_last @ motion), inverted(covariance))
 
@@ -158,6 +156,15 @@ class FrameTracking:
             distance = f"{alignment.residual_m * 100:.1f} cm"
             return _Verdict(trusted=False, reason=f"points lie {distance} off the map")
         return _Verdict(trusted=True, by_field=True)
+
+
+def registered_noise(config: TrackingConfig) -> MotionNoise:
+    """How far odometry by registration may be wrong."""
+    return MotionNoise(
+        distance_m=config.odometry_sigma_m,
+        angle_rad=float(np.deg2rad(config.odometry_sigma_deg)),
+        drift=config.odometry_drift,
+    )
 
 
 def inverted(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

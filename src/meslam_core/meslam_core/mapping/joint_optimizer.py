@@ -87,6 +87,8 @@ class JointOptimizer:
         if T_map_current is None or not self.config.current_rays:
             current = None
         sums, done = np.zeros(3), 0
+        if not len(self.keyframes.drawable(region.keyframes)):
+            return StepLosses()
         while done < steps and not enough(done):
             draws = self._draw(region, min(STEPS_AT_ONCE, steps - done), current)
             batches = self._batches(region, draws, current, refine_poses)
@@ -130,7 +132,7 @@ class JointOptimizer:
         return sums, taken
 
     def _draw(self, region: Region, steps: int, current: Rays | None) -> RayDraws:
-        members = np.array(region.keyframes, np.int64)
+        members = self.keyframes.drawable(region.keyframes)
         return draw_rays(
             self._generator,
             self.config,

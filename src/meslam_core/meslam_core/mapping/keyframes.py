@@ -1,9 +1,9 @@
-"""Keyframes: a compact sample of rays each, in arrays that training gathers from."""
+"""Keyframes: poses, losses and links of all, rays of those that training needs."""
 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,36 +12,13 @@ from numpy.typing import NDArray
 from meslam_core.config import KeyframesConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.mapping.keyframe_links import KeyframeLinks
+from meslam_core.mapping.ray_storage import LEAST_RAYS, Rays, RayStorage, spread_choice
+from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose
 
+__all__ = ["LEAST_RAYS", "KeyframeStore", "Rays", "rays_at", "spread_choice"]
+
 Floats = NDArray[np.float32]
-
-# Fewer rays do not show what a keyframe saw; no keyframe is thinned further than this.
-LEAST_RAYS = 256
-# Beyond the budget the storage grows by this share of it at a time.
-CHUNK_SHARE = 0.25
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Measured rays in the camera frame.
-
-    Attributes:
-        directions: (R, 3) float32 unit vectors.
-        distances_m: (R,) float32 distance of the surface along the ray [m].
-        colors: (R, 3) float32 in [0, 1].
-    """
-
-    directions: torch.Tensor
-    distances_m: torch.Tensor
-    colors: torch.Tensor
-
-    def __len__(self) -> int:
-        return len(self.distances_m)
-
-    def to(self, device: torch.device) -> Rays:
-        """The same rays on another device."""
-        return Rays(self.directions.to(device), self.distances_m.to(device), self.colors.to(device))
 
 
 def rays_at(frame: RgbdFrame, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Rays:
@@ -55,38 +32,21 @@ def rays_at(frame: RgbdFrame, rows: NDArray[np.int64], columns: NDArray[np.int64
     )
 
 
-def spread_choice(count: int, kept: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """`kept` <= `count` different numbers below `count`, ascending.
-
-    One at random of each of `kept` equal stretches: of pixels in raster order the choice covers
-    the image as evenly as they do.
-    """
-    edges = np.arange(kept + 1) * count // kept
-    return edges[:-1] + generator.integers(np.diff(edges))
-
-
 class KeyframeStore:
     """Poses and rays of all keyframes, index-addressed.
 
-    Every keyframe keeps the same number of rays (repeated where it has fewer), so that a batch
-    over many keyframes is one gather. Poses and losses live on the CPU; the rays on `device`. One
-    thread may read poses while another adds keyframes or moves them; nobody may draw or read rays
-    while a keyframe is added.
-
-    Memory stays bounded: at most `ray_budget` rays are stored, 19 bytes each. Where a further
-    keyframe would exceed it, the number of rays of every keyframe, old or new, is halved; a random
-    half remains, spread over the image. No keyframe is thinned below `LEAST_RAYS`: with more than
-    `ray_budget / LEAST_RAYS` keyframes the storage grows after all, in chunks of `CHUNK_SHARE` of
-    the budget. Poses and links, about a hundred bytes each, are not counted.
+    Poses and losses live on the CPU; the rays on `device`, as `RayStorage` keeps them. One thread
+    may read poses while another adds keyframes or moves them; nobody may draw or read rays while
+    a keyframe is added. Poses and links, about five hundred bytes a keyframe, stay in memory.
 
     Args:
         rays_per_keyframe: kept of a keyframe as long as the budget allows.
         device: of the rays.
-        ray_budget: rays of all keyframes together.
+        ray_budget: rays in memory of all keyframes together.
         seed: of the choice of the rays that remain.
+        scratch: where keyframes of regions at rest leave their rays; None keeps all in memory.
 
     Attributes:
-        rays_per_keyframe: the number that every keyframe has now; it falls as the store grows.
         links: measured motions between keyframes.
         stamps_ns: of the keyframes' images.
     """
@@ -97,24 +57,24 @@ class KeyframeStore:
         device: torch.device,
         ray_budget: int = KeyframesConfig.ray_budget,
         seed: int = 0,
+        scratch: ScratchFile | None = None,
     ) -> None:
-        self.rays_per_keyframe = rays_per_keyframe
         self.device = device
-        self.ray_budget = ray_budget
         self.links = KeyframeLinks()
         self.stamps_ns: list[int] = []
+        self.storage = RayStorage(rays_per_keyframe, device, ray_budget, seed, scratch)
         self._lock = threading.Lock()
-        self._generator = np.random.default_rng(seed)
-        # Ray s of keyframe k stands in row k * rays_per_keyframe + s.
-        self._directions = torch.empty(0, 3, device=device)
-        self._distances = torch.empty(0, device=device)
-        self._colors = torch.empty(0, 3, dtype=torch.uint8, device=device)
         self._rotations = np.zeros((0, 3, 3), np.float32)
         self._translations = np.zeros((0, 3), np.float32)
         self._losses = np.zeros(0, np.float32)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @property
+    def rays_per_keyframe(self) -> int:
+        """Rays that every keyframe in memory has now; fewer the more keyframes there are."""
+        return self.storage.per_keyframe
 
     @property
     def rotations(self) -> torch.Tensor:
@@ -153,8 +113,7 @@ class KeyframeStore:
         index = len(self)
         if index == len(self._losses):
             self._grow()
-        self._make_room(index + 1)
-        self._put(index, rays)
+        self.storage.add(rays)
         self.set_pose(index, T_map_camera)
         self._losses[index] = self._losses[:index].max() if index else 1.0
         self.stamps_ns.append(stamp_ns)
@@ -195,57 +154,6 @@ class KeyframeStore:
                 array[: len(old)] = old
                 setattr(self, name, array)
 
-    def _make_room(self, keyframes: int) -> None:
-        """Room for the rays of so many keyframes, by fewer rays of each or by more storage."""
-        budget = self.ray_budget
-        while keyframes * self.rays_per_keyframe > budget and self.rays_per_keyframe > LEAST_RAYS:
-            self._thin(max(self.rays_per_keyframe // 2, LEAST_RAYS))
-        wanted, stored = keyframes * self.rays_per_keyframe, len(self._distances)
-        if wanted <= stored:
-            return
-        if wanted > budget:
-            self._enlarge(wanted + int(CHUNK_SHARE * budget))
-        elif self.device.type == "cpu":
-            # Memory that was never touched costs nothing there.
-            self._enlarge(budget)
-        else:
-            self._enlarge(min(max(16 * self.rays_per_keyframe, 2 * stored, wanted), budget))
-
-    def _enlarge(self, capacity: int) -> None:
-        for name in ("_directions", "_distances", "_colors"):
-            old = getattr(self, name)
-            used = len(self) * self.rays_per_keyframe
-            new = old.new_empty((capacity, *old.shape[1:]))
-            new[:used] = old[:used]
-            setattr(self, name, new)
-
-    def _thin(self, kept: int) -> None:
-        """Keep so many rays of every keyframe, in place."""
-        before = self.rays_per_keyframe
-        for index in range(len(self)):
-            slots = torch.from_numpy(spread_choice(before, kept, self._generator)).to(self.device)
-            for rays in (self._directions, self._distances, self._colors):
-                # What is overwritten belonged to this keyframe or to one that has moved already.
-                row = rays[index * before : (index + 1) * before]
-                rays[index * kept : (index + 1) * kept] = row[slots]
-        self.rays_per_keyframe = kept
-
-    def _put(self, index: int, rays: Rays) -> None:
-        kept = self.rays_per_keyframe
-        if len(rays) > kept:
-            chosen = spread_choice(len(rays), kept, self._generator)
-        else:
-            chosen = np.arange(kept) % len(rays)
-        slots = torch.from_numpy(chosen)
-        row = self._row(index)
-        self._directions[row] = rays.directions[slots].to(self.device)
-        self._distances[row] = rays.distances_m[slots].to(self.device)
-        self._colors[row] = (rays.colors[slots] * 255.0).round().to(self.device, torch.uint8)
-
-    def _row(self, index: int) -> slice:
-        """Where a keyframe's rays are stored."""
-        return slice(index * self.rays_per_keyframe, (index + 1) * self.rays_per_keyframe)
-
     def pose(self, index: int) -> Pose:
         """T_map_camera (4, 4) of a keyframe."""
         pose = np.eye(4)
@@ -268,12 +176,16 @@ class KeyframeStore:
             self._rotations[keyframes] = rotations
             self._translations[keyframes] = translations
 
+    def drawable(self, keyframes: Sequence[int]) -> NDArray[np.int64]:
+        """Those of some keyframes whose rays are in memory, in the same order."""
+        numbers = np.array(keyframes, np.int64)
+        return numbers[self.storage.in_memory(numbers)]
+
     def rays(self, keyframes: torch.Tensor, slots: torch.Tensor) -> Rays:
-        """Rays number `slots` (R,) of keyframes number `keyframes` (R,)."""
-        rows = keyframes * self.rays_per_keyframe + slots
-        return Rays(
-            self._directions[rows], self._distances[rows], self._colors[rows].float() / 255.0
-        )
+        """Rays number `slots` (R,) of keyframes number `keyframes` (R,), which are in memory."""
+        rows = self.storage.rows(keyframes.cpu().numpy(), slots.cpu().numpy())
+        directions, distances, colors = self.storage.rays(rows)
+        return Rays(directions, distances, colors.float() / 255.0)
 
     def ray_arrays(
         self, keyframes: NDArray[np.int64], slots: NDArray[np.int64]
@@ -283,14 +195,11 @@ class KeyframeStore:
         Returns:
             Directions (..., 3), distances (...) [m], and colours (..., 3) in [0, 255].
         """
-        rows = keyframes * self.rays_per_keyframe + slots
-        return (
-            self._directions.numpy().take(rows, axis=0),
-            self._distances.numpy().take(rows),
-            self._colors.numpy().take(rows, axis=0),
-        )
+        return self.storage.arrays(self.storage.rows(keyframes, slots))
 
     def all_rays(self, index: int) -> Rays:
-        """Every ray of one keyframe, the store's own: valid until a keyframe is added."""
-        row = self._row(index)
-        return Rays(self._directions[row], self._distances[row], self._colors[row].float() / 255.0)
+        """Every ray of one keyframe; the store's own or read from disk.
+
+        Valid until a keyframe is added.
+        """
+        return self.storage.read(index)

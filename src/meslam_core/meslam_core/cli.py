@@ -280,10 +280,15 @@ def convert(
 @app.command()
 def simulate(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="The space to walk through.")],
-    duration: Annotated[float, typer.Option(help="Length of the recording [s].")],
     out: Annotated[Path, typer.Option(metavar="FILE.mcap", help="The recording.")],
+    duration: Annotated[
+        float | None, typer.Option(help="Length of the recording [s]; by default one round.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of path and noise.")] = 0,
     fps: Annotated[float, typer.Option(help="Frames a second.")] = 15.0,
+    motion_blur: Annotated[
+        float, typer.Option(help="Exposure time during which the image smears [s].")
+    ] = 0.0,
 ) -> None:
     """Record a simulated hand-held camera, with the true poses and surface beside it.
 
@@ -293,7 +298,7 @@ def simulate(
     from meslam_core.simulation.simulator import simulate as simulated
     from meslam_core.simulation.writer import truth_path, write_simulation
 
-    simulation = simulated(scene, duration, seed, fps=fps)
+    simulation = simulated(scene, duration, seed, fps=fps, motion_blur_s=motion_blur)
     with counting_bar(error_console(), "frames") as progress:
         write_simulation(simulation, out, progress)
     typer.echo(f"{out}: {len(simulation)} frames; true poses in {truth_path(out)}")

@@ -19,6 +19,10 @@ EXPOSED_SHARE = 0.92
 CORNER_REACH_M = 0.9
 """Surfaces nearer than this take ambient light away [m]."""
 
+LONG_M = 5.0
+BORDER_SHARE, BORDER_M = 0.02, 0.02
+"""How far the outer nodes lie inside a patch: a share of it, or of a long one a length [m]."""
+
 Grid = tuple[int, int]
 
 
@@ -55,8 +59,11 @@ def _surface_at_nodes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points and normals (rows * columns, 3) of the grid nodes, by unrolling backwards."""
     # Nodes on the very border would fall beside the triangles or into the next wall.
-    x = np.linspace(0.02, 0.98, columns) * patch.width_m
-    y = np.linspace(0.02, 0.98, rows) * patch.height_m
+    x, y = (
+        np.linspace(inset, 1 - inset, count) * length
+        for count, length in ((columns, patch.width_m), (rows, patch.height_m))
+        for inset in [BORDER_SHARE if length <= LONG_M else BORDER_M / length]
+    )
     nodes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     corners = patch.vertices[patch.triangles]
     triangle_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -91,14 +98,16 @@ def _irradiance(
         total += scene.ambient / len(sky) * ~_blocked(caster, start, turned, CORNER_REACH_M)
     for lamp in scene.lamps:
         samples = _lamp_points(lamp)
+        near = np.linalg.norm(start - lamp.center, axis=1) < lamp.reach_m
+        lit = start[near]
         for sample in samples:
-            toward = sample - start
+            toward = sample - lit
             squared = (toward**2).sum(1)
             distance = np.sqrt(squared)
-            received = (toward * normals).sum(1) / distance
+            received = (toward * normals[near]).sum(1) / distance
             sent = toward[:, 2] / distance
             power = lamp.power / len(samples) * received.clip(0) * sent.clip(0) / squared.clip(0.05)
-            total += power * ~_blocked(caster, start, toward, 1.0)
+            total[near] += power * ~_blocked(caster, lit, toward, 1.0)
     return np.maximum(total, 1e-3)
 
 

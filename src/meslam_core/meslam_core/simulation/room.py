@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from meslam_core.simulation import furniture, textures
-from meslam_core.simulation.scene import Lamp, Patch, Scene, box, cylinder, quad, sphere
-from meslam_core.simulation.textures import Texture
+from meslam_core.simulation.path import Route
+from meslam_core.simulation.scene import Lamp, Patch, Scene, box, cylinder, sphere
+from meslam_core.simulation.walls import Chamber
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 5.0, 4.0, 2.6
 
-WALLS = {
-    "south": ((LENGTH_M, 0.0), (-1.0, 0.0), LENGTH_M),
-    "north": ((0.0, WIDTH_M), (1.0, 0.0), LENGTH_M),
-    "west": ((0.0, 0.0), (0.0, 1.0), WIDTH_M),
-    "east": ((LENGTH_M, WIDTH_M), (0.0, -1.0), WIDTH_M),
-}
-"""Each wall's upper left corner as seen from inside, its direction to the right, its length."""
+CHAMBER = Chamber(0.0, 0.0, LENGTH_M, WIDTH_M, HEIGHT_M)
 
 
 def room() -> Scene:
@@ -27,10 +21,10 @@ def room() -> Scene:
     return Scene("room", patches, lamps, ambient=0.45, route=_route())
 
 
-def _route() -> NDArray[np.float64]:
+def _route() -> Route:
     """A figure of eight through the middle, while the camera turns once about itself."""
     phase = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    return np.stack(
+    anchors = np.stack(
         [
             2.5 + 0.95 * np.sin(phase),
             2.0 + 0.50 * np.sin(2 * phase),
@@ -40,23 +34,7 @@ def _route() -> NDArray[np.float64]:
         ],
         axis=1,
     )
-
-
-def _on_wall(
-    wall: str,
-    left: float,
-    top: float,
-    width: float,
-    height: float,
-    texture: Texture,
-    texel_m: float,
-    gap: float = 0.0,
-) -> Patch:
-    """A rectangle `left` m from the wall's left edge, its upper edge `top` m above the floor."""
-    (x, y), (right_x, right_y), _ = WALLS[wall]
-    inward_x, inward_y = right_y, -right_x
-    corner = (x + left * right_x + gap * inward_x, y + left * right_y + gap * inward_y, top)
-    return quad(corner, (width * right_x, width * right_y, 0), (0, 0, -height), texture, texel_m)
+    return Route(anchors)
 
 
 def _shell() -> list[Patch]:
@@ -68,17 +46,14 @@ def _shell() -> list[Patch]:
         "east": textures.plaster((0.86, 0.80, 0.68), roughness=0.04),
     }
     patches = [
-        _on_wall(wall, 0.0, HEIGHT_M, length, HEIGHT_M, papers[wall], 0.003)
-        for wall, (_, _, length) in WALLS.items()
+        (wall := CHAMBER.wall(side)).hung(0.0, HEIGHT_M, wall.length_m, HEIGHT_M, paper, 0.003)
+        for side, paper in papers.items()
     ]
     ceiling = textures.checker((0.86, 0.86, 0.84), (0.80, 0.80, 0.79), 0.6)
-    down, across = (0, -WIDTH_M, 0), (LENGTH_M, 0, 0)
-    patches.append(quad((0, WIDTH_M, 0), across, down, textures.planks((0.60, 0.44, 0.30)), 0.003))
-    patches.append(
-        quad((0, 0, HEIGHT_M), across, (0, WIDTH_M, 0), ceiling, 0.004),
-    )
+    patches += CHAMBER.floor_and_ceiling(textures.planks((0.60, 0.44, 0.30)), ceiling)
     wood = textures.wood((0.88, 0.86, 0.82), contrast=0.08)
-    for wall, (_, _, length) in WALLS.items():
+    for wall in papers:
+        length = CHAMBER.wall(wall).length_m
         if wall in ("south", "north"):
             y = 0.009 if wall == "south" else WIDTH_M - 0.009
             patches += box((length / 2, y, 0.045), (length - 0.05, 0.016, 0.09), wood)
@@ -92,16 +67,16 @@ def _wall_decoration() -> list[Patch]:
     """Window, curtains, posters, a door and a radiator."""
     poster = textures.poster()
     patches = [
-        _on_wall("north", 0.50, 2.05, 0.60, 0.85, poster, 0.002, gap=0.012),
-        _on_wall("north", 2.30, 2.25, 0.90, 0.60, poster, 0.002, gap=0.012),
-        _on_wall("north", 3.50, 2.10, 0.45, 0.62, poster, 0.002, gap=0.012),
-        _on_wall("north", 4.20, 2.00, 0.50, 0.70, poster, 0.002, gap=0.012),
-        _on_wall("east", 0.35, 2.10, 0.70, 1.00, poster, 0.002, gap=0.012),
-        _on_wall("west", 0.25, 2.05, 0.55, 0.78, poster, 0.002, gap=0.012),
-        _on_wall("west", 3.20, 2.10, 0.60, 0.80, poster, 0.002, gap=0.012),
-        _on_wall("south", 0.45, 2.10, 0.60, 0.42, poster, 0.002, gap=0.012),
-        _on_wall("south", 0.50, 1.55, 0.42, 0.60, poster, 0.002, gap=0.012),
-        _on_wall("south", 1.70, 2.15, 1.60, 1.15, textures.window_view(), 0.003, gap=0.012),
+        CHAMBER.wall("north").hung(0.50, 2.05, 0.60, 0.85, poster, 0.002, gap=0.012),
+        CHAMBER.wall("north").hung(2.30, 2.25, 0.90, 0.60, poster, 0.002, gap=0.012),
+        CHAMBER.wall("north").hung(3.50, 2.10, 0.45, 0.62, poster, 0.002, gap=0.012),
+        CHAMBER.wall("north").hung(4.20, 2.00, 0.50, 0.70, poster, 0.002, gap=0.012),
+        CHAMBER.wall("east").hung(0.35, 2.10, 0.70, 1.00, poster, 0.002, gap=0.012),
+        CHAMBER.wall("west").hung(0.25, 2.05, 0.55, 0.78, poster, 0.002, gap=0.012),
+        CHAMBER.wall("west").hung(3.20, 2.10, 0.60, 0.80, poster, 0.002, gap=0.012),
+        CHAMBER.wall("south").hung(0.45, 2.10, 0.60, 0.42, poster, 0.002, gap=0.012),
+        CHAMBER.wall("south").hung(0.50, 1.55, 0.42, 0.60, poster, 0.002, gap=0.012),
+        CHAMBER.wall("south").hung(1.70, 2.15, 1.60, 1.15, textures.window_view(), 0.003, gap=0.012),
     ]
     curtain = textures.fabric((0.66, 0.28, 0.24), (0.82, 0.62, 0.36))
     for x in (1.45, 3.55):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from meslam_core.simulation.path import Route
 from meslam_core.simulation.textures import Texture
 
 Vector = Sequence[float] | NDArray[np.floating]
@@ -46,11 +47,13 @@ class Lamp:
         center: middle of the square [m].
         side_m: its side [m].
         power: irradiance straight below it at 1 m, in units of a mid exposure.
+        reach_m: how far its light is followed [m].
     """
 
     center: tuple[float, float, float]
     side_m: float
     power: float
+    reach_m: float = np.inf
 
 
 @dataclass
@@ -62,15 +65,14 @@ class Scene:
         patches: all surfaces.
         lamps: all lights.
         ambient: light that reaches every open surface, in units of a mid exposure.
-        route: (N, 5) closed way of the camera: x, y, z [m], yaw and pitch [rad]; yaw runs on
-            over full turns, pitch is positive downwards. The last row leads back to the first.
+        route: the way of the camera.
     """
 
     name: str
     patches: list[Patch] = field(default_factory=list)
     lamps: list[Lamp] = field(default_factory=list)
     ambient: float = 0.35
-    route: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+    route: Route = field(default_factory=lambda: Route(np.zeros((1, 5))))
 
 
 def quad(

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from meslam_core.errors import ConfigError
+from meslam_core.simulation.building import building
 from meslam_core.simulation.room import room
 from meslam_core.simulation.scene import Scene
 
-SCENES: dict[str, Callable[[], Scene]] = {"room": room}
+SCENES: dict[str, Callable[[], Scene]] = {"building": building, "room": room}
 
 
 def build_scene(name: str) -> Scene:

@@ -127,7 +127,7 @@ class Simulation:
 
 def simulate(
     scene: str,
-    duration_s: float,
+    duration_s: float | None = None,
     seed: int = 0,
     camera: PinholeCamera | None = None,
     fps: float = 15.0,
@@ -138,7 +138,7 @@ def simulate(
 
     Args:
         scene: a name of `scenes.SCENES`; the same name is always the same space.
-        duration_s: length of the recording [s].
+        duration_s: length of the recording [s]; None for one round of the scene's route.
         seed: of the path, the sensor's noise and the exposure.
         camera: intrinsics; None for a D435's at 640x480.
         fps: frames a second.
@@ -148,18 +148,19 @@ def simulate(
     Raises:
         ConfigError: for an unknown scene, or a duration or rate that is not positive.
     """
-    if not (duration_s > 0 and fps > 0 and np.isfinite(duration_s * fps)):
-        raise ConfigError(
-            f"a simulation of {duration_s} s at {fps} frames/s has no frames; both must be positive"
-        )
     if motion_blur_s < 0 or seed < 0:
         raise ConfigError(
             f"motion_blur_s is {motion_blur_s} and seed {seed}; neither may be negative"
         )
+    built = _scene(scene)
+    duration_s = built.route.round_s if duration_s is None else duration_s
+    if not (duration_s > 0 and fps > 0 and np.isfinite(duration_s * fps)):
+        raise ConfigError(
+            f"a simulation of {duration_s} s at {fps} frames/s has no frames; both must be positive"
+        )
     camera = camera or D435_CAMERA
     # Finer texels than a pixel at half a metre are wasted on a small camera.
     texel_scale = max(1.0, float(2 ** round(np.log2(D435_CAMERA.fx / camera.fx))))
-    built, renderer = _prepared(scene, texel_scale)
     path = HandheldPath(built.route, duration_s, seed)
     indices = np.arange(max(1, round(duration_s * fps)))
     truth = Trajectory(
@@ -168,7 +169,7 @@ def simulate(
     )
     return Simulation(
         built,
-        renderer,
+        _renderer(scene, texel_scale),
         truth,
         path,
         camera,
@@ -179,8 +180,12 @@ def simulate(
     )
 
 
+@lru_cache(maxsize=4)
+def _scene(name: str) -> Scene:
+    return build_scene(name)
+
+
 @lru_cache(maxsize=2)
-def _prepared(scene: str, texel_scale: float) -> tuple[Scene, Renderer]:
+def _renderer(scene: str, texel_scale: float) -> Renderer:
     """A scene with its textures baked; the costly part, shared by simulations of one process."""
-    built = build_scene(scene)
-    return built, Renderer(built, texel_scale)
+    return Renderer(_scene(scene), texel_scale)

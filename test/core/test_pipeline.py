@@ -9,13 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from data.drifting_odometry import drifting
 from data.memory_recording import MemoryRecording
 
 from meslam_core.errors import EvaluationError, OutputError, RecordingError
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.pipeline import RunOptions, run
 from meslam_core.slam import FrameResult
-from meslam_core.trajectory import read_tum
+from meslam_core.trajectory import Trajectory, read_tum, write_tum
 
 
 class Watcher:
@@ -139,6 +140,36 @@ def test_a_truth_that_cannot_be_read_is_known_before_the_first_frame(
     quick_config, room_frames, tmp_path
 ):
     watcher, options = Watcher(), RunOptions(truth=tmp_path / "none.txt")
+    with pytest.raises(EvaluationError, match=r"none\.txt"):
+        run(MemoryRecording(room_frames), quick_config, tmp_path / "out", options, watcher)
+    assert watcher.told == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_given_poses_take_the_place_of_odometry(quick_config, room_frames, room_poses, tmp_path):
+    stamps = np.array([frame.stamp_ns for frame in room_frames])
+    truth = Trajectory(stamps, np.array(room_poses))
+    write_tum(tmp_path / "truth.txt", truth)
+    # Wheels report at other instants than the camera, and fail for a while.
+    known = [number for number in range(0, 16, 2) if number != 8]
+    write_tum(tmp_path / "wheels.txt", drifting(truth).subset(np.array(known)))
+    options = RunOptions(truth=tmp_path / "truth.txt", odometry=tmp_path / "wheels.txt")
+    results = []
+    watcher = Watcher()
+    watcher.processed = lambda offered, result: results.append(result)
+    run(MemoryRecording(room_frames), quick_config, tmp_path / "out", options, watcher)
+    without = [number for number, result in enumerate(results) if not result.odometry.valid]
+    assert without == [7, 8, 9, 15]
+    assert "gap of 0.267 s" in results[8].odometry.reason
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["frames_tracked"] == len(room_frames)
+    assert report["ate_rmse_m"] < 0.015
+
+
+def test_given_poses_that_cannot_be_read_are_known_before_the_first_frame(
+    quick_config, room_frames, tmp_path
+):
+    watcher, options = Watcher(), RunOptions(odometry=tmp_path / "none.txt")
     with pytest.raises(EvaluationError, match=r"none\.txt"):
         run(MemoryRecording(room_frames), quick_config, tmp_path / "out", options, watcher)
     assert watcher.told == []

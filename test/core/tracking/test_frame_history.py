@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from meslam_core.mapping.keyframes import KeyframeStore, Rays
-from meslam_core.odometry import OdometryEstimate
+from meslam_core.odometry import MotionNoise, OdometryEstimate
 from meslam_core.se3 import Pose, exp, inverse, log
 from meslam_core.tracking.frame_history import (
     MAX_EXTRAPOLATION,
@@ -109,6 +111,17 @@ def test_odometry_gives_the_motion_since_the_last_frame_that_had_it(history):
     np.testing.assert_allclose(moved[1], inverse(before) @ now, atol=1e-12)
     assert history.moved(None) is None
     assert history.moved(estimate(now, valid=False)) is None
+
+
+def test_given_odometry_counts_from_its_last_valid_estimate(history):
+    """A registration's chain goes on through a guess; given poses have nothing to do with it."""
+    noise = MotionNoise(0.001, 0.001, 0.01)
+    before, guess, now = (exp(number * STEP) for number in (1, 7, 3))
+    for odometry in (estimate(before), estimate(guess, valid=False)):
+        history.add(0, START, 0, np.eye(4), replace(odometry, noise=noise))
+    moved = history.moved(replace(estimate(now), noise=noise))
+    assert moved is not None
+    np.testing.assert_allclose(moved[1], exp(2 * STEP), atol=1e-12)
 
 
 def test_odometry_is_carried_over_a_short_gap_only(history):

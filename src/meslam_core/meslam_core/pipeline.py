@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from meslam_core.errors import EvaluationError, FrameError, RecordingError
 from meslam_core.evaluation.report import truth_entries
 from meslam_core.interruption import stop_request
 from meslam_core.map.store import MapStore
-from meslam_core.map.stored_region import snapshot
+from meslam_core.map.stored_region import StoredRegion, snapshot
 from meslam_core.odometry import GivenOdometry, make_odometry
 from meslam_core.odometry_worker import OdometryWorker
 from meslam_core.pacing import PacedFrames
@@ -258,15 +259,19 @@ def _write_map(slam: Slam, stamp_ns: int, path: Path) -> int:
     """Store the map of all frames up to a stamp and return its size [bytes]."""
     if slam.atlas is None:
         return 0
+    store = MapStore(path)
+    store.save(_snapshots(slam, stamp_ns), slam.atlas.grid, precision=slam.config.map.codec)
+    return store.map_bytes
+
+
+def _snapshots(slam: Slam, stamp_ns: int) -> Iterator[StoredRegion]:
+    """The regions one after the other: those at rest are in memory only while they are written."""
+    assert slam.atlas is not None
     active = slam.atlas.active
-    stored = []
     for region in slam.atlas.regions.values():
         trained = slam.keyframes.stamps_ns[max(region.keyframes)]
         newest = stamp_ns if any(region is each for each in active) else trained
-        stored.append(snapshot(region, newest))
-    store = MapStore(path)
-    store.save(stored, slam.atlas.grid, precision=slam.config.map.codec)
-    return store.map_bytes
+        yield snapshot(region, newest)
 
 
 def _evaluate(

@@ -102,10 +102,15 @@ def observed_volume_m3(slam: Slam) -> float:
     centers = np.array([region.T_map_region[:3, 3] for region in regions])
     volume = 0.0
     for number, region in enumerate(regions):
-        positions = _observed_positions(region.mask) @ region.T_map_region[:3, :3].T
-        distances = [np.linalg.norm(positions + centers[number] - c, axis=1) for c in centers]
-        nearest = np.argmin(distances, axis=0) == number
-        volume += np.count_nonzero(nearest) * region.mask.voxel_m**3
+        mask = region.observed()
+        positions = _observed_positions(mask) @ region.T_map_region[:3, :3].T + centers[number]
+        own = np.linalg.norm(positions - centers[number], axis=1)
+        nearest = np.ones(len(positions), bool)
+        for other, center in enumerate(centers):
+            if other != number:
+                distance = np.linalg.norm(positions - center, axis=1)
+                nearest &= own <= distance if number < other else own < distance
+        volume += np.count_nonzero(nearest) * mask.voxel_m**3
     return float(volume)
 
 

@@ -21,7 +21,9 @@ from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
 from meslam_core.mapping.training_worker import Training, TrainingWorker
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.atlas import RegionAtlas
+from meslam_core.regions.observed_mask import ObservedMask
 from meslam_core.regions.region import Region
+from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.frame_history import KeyframePoses
 from meslam_core.tracking.frame_tracking import FrameTracking, TrackedPose
@@ -44,6 +46,8 @@ MADE_UP_A_FRAME = 40
 ODOMETRY_LINK_WEIGHT = 0.05
 # A refinement comes in portions of so many steps, the last at this share of the learning rate.
 REFINING_STEPS = 50
+# Of several regions each is refined so long before it is the next one's turn, on average.
+TURN_STEPS = 400
 LAST_RATE_FACTOR = 0.05
 
 
@@ -57,6 +61,19 @@ class _Pending:
     result: FrameResult
     reference: int
     T_reference_camera: Pose
+
+
+@dataclass
+class _Refinement:
+    """Whose turn it is.
+
+    Attributes:
+        region: number of the region that is refined, in the order of their creation.
+        left: steps that it still gets in this turn.
+    """
+
+    region: int = -1
+    left: int = 0
 
 
 class Slam:
@@ -87,7 +104,10 @@ class Slam:
         self.config = config
         self.device = field_device(config.field)
         kept = config.keyframes
-        self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed)
+        # One network needs all its keyframes, always.
+        single, folder = config.regions.single, config.runtime.work_dir
+        self._scratch = None if single else ScratchFile(folder)
+        self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed, self._scratch)
         self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
         self.policy = KeyframePolicy(config.keyframes, config.field)
         self.tracking = FrameTracking(config.tracking)
@@ -104,6 +124,8 @@ class Slam:
         self._trained: list[Region] = []
         self._latest_training = Training()
         self._steps_owed = 0
+        self._turn = 0
+        self._refined = _Refinement()
         self._pending: _Pending | None = None
         self._keyframe_odometry: OdometryEstimate | None = None
         # What tracking sees of the working region while training changes the original.
@@ -216,20 +238,42 @@ class Slam:
         self._finish_training()
         if self.atlas is None:
             return
-        total = sum(len(region.keyframes) for region in self.atlas.regions.values())
-        for region in self.atlas.regions.values():
-            share = len(region.keyframes) / max(total, 1)
-            self.optimizer.train(
-                region,
-                max(1, round(steps * share)),
-                rate_factor=1.0 + progress * (LAST_RATE_FACTOR - 1.0),
-            )
+        rate_factor = 1.0 + progress * (LAST_RATE_FACTOR - 1.0)
+        while steps > 0:
+            region, portion = self._next_to_refine(steps)
+            with self.atlas.awake(region):
+                self.optimizer.train(region, portion, rate_factor=rate_factor)
             region.version += 1
+            steps -= portion
         self._look()
+
+    @property
+    def refining_steps(self) -> int:
+        """How many steps a refinement of the whole map takes."""
+        regions = len(self.atlas.regions) if self.atlas else 0
+        return self.config.mapping.final_iterations * max(regions, 1)
+
+    def _next_to_refine(self, most: int) -> tuple[Region, int]:
+        """The region whose turn it is, and at most so many steps of those that it gets.
+
+        In one round every region gets steps in proportion to its keyframes, all at once: waking
+        it costs as much as some of them.
+        """
+        assert self.atlas is not None
+        regions = list(self.atlas.regions.values())
+        if self._refined.left <= 0:
+            self._refined.region = (self._refined.region + 1) % len(regions)
+            mean = sum(len(each.keyframes) for each in regions) / len(regions)
+            share = len(regions[self._refined.region].keyframes) / max(mean, 1.0)
+            turn = REFINING_STEPS if len(regions) == 1 else TURN_STEPS
+            self._refined.left = max(1, round(turn * share))
+        portion = min(most, self._refined.left)
+        self._refined.left -= portion
+        return regions[self._refined.region % len(regions)], portion
 
     def finish(self) -> None:
         """Refine once more over everything seen; then mark the observed space anew."""
-        total = self.config.mapping.final_iterations
+        total = self.refining_steps
         for done in range(0, total, REFINING_STEPS):
             self.refine(min(REFINING_STEPS, total - done), done / total)
         self.settle()
@@ -239,9 +283,9 @@ class Slam:
         self._finish_training()
         if self.atlas is None:
             return
-        self.atlas.rebuild_masks()
         for region in self.atlas.regions.values():
-            region.version += 1
+            with self.atlas.awake(region):
+                region.version += self.atlas.rebuild_mask(region)
         self._look()
 
     def trajectory(self) -> Trajectory:
@@ -274,7 +318,11 @@ class Slam:
             return
         working = self.atlas.working
         self._viewed_field.load_flat(working.field.flat())
-        self._view = replace(working, field=self._viewed_field)
+        mask = working.mask
+        if working.unmarked:
+            # Training is going to change the mask.
+            mask = ObservedMask.from_flags(mask.flags.copy(), mask.voxel_m)
+        self._view = working.viewed(self._viewed_field, mask)
         self._history.keyframes = KeyframePoses(self.keyframes)
 
     def _begin_training(self, pending: _Pending, pose: Pose) -> bool:
@@ -298,9 +346,19 @@ class Slam:
         steps = mapping.keyframe_iterations if is_keyframe else mapping.iterations
         steps += min(self._steps_owed, MADE_UP_A_FRAME)
         self._look()
-        self._trained = self.atlas.active
+        self._trained = self._next_to_train()
         self._worker.start(partial(self._train, self._trained, steps, current, pose, linked))
         return is_keyframe
+
+    def _next_to_train(self) -> list[Region]:
+        """The working region, and in turn one of the others that contain the camera.
+
+        So a frame costs the same at a corner, where eight regions meet, as between two.
+        """
+        assert self.atlas is not None
+        others = self.atlas.training
+        self._turn += 1
+        return [self.atlas.working, *(others[self._turn % len(others)] for _ in others[:1])]
 
     def _train(
         self,
@@ -310,8 +368,10 @@ class Slam:
         pose: Pose,
         linked: tuple[int, RgbdFrame, Rays] | None,
     ) -> Training:
-        """Train the working region, which comes first, and the others half as long."""
+        """Train the working region, which comes first, and the other one half as long."""
+        assert self.atlas is not None
         started = time.perf_counter()
+        self.atlas.settle()
         if linked is not None and self._linker is not None:
             for link in self._linker.link(*linked):
                 self.keyframes.add_link(link.first, link.second, link.T_first_second)
@@ -336,7 +396,9 @@ class Slam:
     def _start(self, pending: _Pending) -> None:
         """The first frame defines the map frame and trains the first region from nothing."""
         frame, pose = pending.frame, pending.tracked.T_map_camera
-        self.atlas = RegionAtlas(self.config, pose[:3, 3], self.keyframes, self._seed)
+        self.atlas = RegionAtlas(
+            self.config, pose[:3, 3], self.keyframes, self._seed, self._scratch
+        )
         self._add_keyframe(frame, pending.pixels, pose, pending.result.odometry)
         self._trained = [self.atlas.working]
         self._steps_owed = self.config.mapping.first_iterations

@@ -113,7 +113,7 @@ class MappingSession:
 
     def refine(self) -> bool:
         """Refine the map for a moment while no image comes; False when that is done."""
-        total = self._config.mapping.final_iterations
+        total = self._slam.refining_steps if self._slam else 0
         if self._slam is None or self._refined_steps >= total:
             return False
         self._slam.refine(REFINING_STEPS, self._refined_steps / total)

@@ -64,7 +64,9 @@ def test_a_frame_is_aligned_alike_on_either_field(mapped_room, kernel_field):
     guess = mapped_room.poses[15].copy()
     guess[:3, 3] += [0.01, -0.012, 0.008]
     tracker = FieldTracker(TrackingConfig())
-    regions = [dataclasses.replace(mapped_room.region, field=f) for f in (kernel_field, reference)]
+    regions = [
+        mapped_room.region.viewed(f, mapped_room.region.mask) for f in (kernel_field, reference)
+    ]
     first, second = (tracker.align(region, rays, guess) for region in regions)
     offset = inverse(first.T_map_camera) @ second.T_map_camera
     assert np.abs(offset - np.eye(4)).max() < 1e-3

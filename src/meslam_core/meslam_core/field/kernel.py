@@ -274,6 +274,20 @@ class KernelField:
         self.fused.zero_gradients()
         self.fused.reset_optimizer()
 
+    def optimizer_state(self) -> tuple[Floats, Floats, int]:
+        """Adam's first and second moments in the layout of `flat`, and its number of steps."""
+        return self.fused.optimizer_state()
+
+    def load_optimizer_state(self, first: Floats, second: Floats, step: int) -> None:
+        """Go on where an optimiser was that had this state.
+
+        Raises:
+            ValueError: the moments have another length or numbers that are not finite.
+        """
+        self.fused.set_optimizer_state(
+            np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32), step
+        )
+
 
 class _Evaluation(torch.autograd.Function):
     """Lets torch's graph end in the kernel.

@@ -52,6 +52,14 @@ class FieldModel(Protocol):
         """Replace the weights and forget the optimiser's state."""
         ...
 
+    def optimizer_state(self) -> tuple[Floats, Floats, int]:
+        """Adam's first and second moments in the layout of `flat`, and its number of steps."""
+        ...
+
+    def load_optimizer_state(self, first: Floats, second: Floats, step: int) -> None:
+        """Go on where an optimiser was that had this state."""
+        ...
+
 
 class TorchField:
     """`FieldModel` on torch: the reference on the CPU, and the fast path on a GPU."""
@@ -107,3 +115,30 @@ class TorchField:
     def load_flat(self, vector: Floats) -> None:
         self.network.load_flat(vector)
         self._optimizer = self._new_optimizer()
+
+    def optimizer_state(self) -> tuple[Floats, Floats, int]:
+        zeros = np.zeros_like(self.flat())
+        states = [self._optimizer.state.get(p) for p in self.network.parameters()]
+        if not all(states):
+            return zeros, zeros.copy(), 0
+        first, second = (
+            torch.cat([state[name].reshape(-1) for state in states if state]).cpu().numpy()
+            for name in ("exp_avg", "exp_avg_sq")
+        )
+        return first, second, int(states[0]["step"]) if states[0] else 0
+
+    def load_optimizer_state(self, first: Floats, second: Floats, step: int) -> None:
+        self._optimizer = self._new_optimizer()
+        if not step:
+            return
+        at = 0
+        for parameter in self.network.parameters():
+            part = slice(at, at + parameter.numel())
+            at = part.stop
+            moments = (torch.from_numpy(m[part].copy()) for m in (first, second))
+            average, squares = (m.reshape(parameter.shape).to(self.device) for m in moments)
+            self._optimizer.state[parameter] = {
+                "step": torch.tensor(float(step)),
+                "exp_avg": average,
+                "exp_avg_sq": squares,
+            }

@@ -93,19 +93,20 @@ class StoredRegion:
 
 
 def snapshot(region: Region, stamp_ns: int) -> StoredRegion:
-    """A live region as it is now; later training does not change the snapshot.
+    """A region of the atlas as it is now, awake or at rest; later training does not change it.
 
     Args:
         region: of the atlas.
         stamp_ns: of the newest image it was trained with [ns].
     """
+    mask = region.observed()
     return StoredRegion(
         index=region.index,
         T_map_region=region.T_map_region.copy(),
         side_m=region.side_m,
-        architecture=Architecture.of(region.field.config),
-        parameters=region.field.flat().copy(),
-        mask=ObservedMask.from_flags(region.mask.flags.copy(), region.mask.voxel_m),
+        architecture=Architecture.of(region.field_config),
+        parameters=region.weights(),
+        mask=ObservedMask.from_flags(mask.flags.copy(), mask.voxel_m),
         version=region.version,
         stamp_ns=stamp_ns,
         keyframes=len(region.keyframes),

@@ -20,6 +20,9 @@ __all__ = ["LEAST_RAYS", "KeyframeStore", "Rays", "rays_at", "spread_choice"]
 
 Floats = NDArray[np.float32]
 
+# So many points of a keyframe tell what it sees.
+SEEN_POINTS = 64
+
 
 def rays_at(frame: RgbdFrame, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Rays:
     """The rays through given pixels of a frame; the pixels must have depth."""
@@ -37,7 +40,7 @@ class KeyframeStore:
 
     Poses and losses live on the CPU; the rays on `device`, as `RayStorage` keeps them. One thread
     may read poses while another adds keyframes or moves them; nobody may draw or read rays while
-    a keyframe is added. Poses and links, about five hundred bytes a keyframe, stay in memory.
+    a keyframe is added. Poses and links, about two kilobytes a keyframe, stay in memory.
 
     Args:
         rays_per_keyframe: kept of a keyframe as long as the budget allows.
@@ -67,6 +70,8 @@ class KeyframeStore:
         self._rotations = np.zeros((0, 3, 3), np.float32)
         self._translations = np.zeros((0, 3), np.float32)
         self._losses = np.zeros(0, np.float32)
+        # Some surface points of each keyframe, camera frame.
+        self._points = np.zeros((0, SEEN_POINTS, 3), np.float32)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -114,6 +119,9 @@ class KeyframeStore:
         if index == len(self._losses):
             self._grow()
         self.storage.add(rays)
+        some = np.arange(SEEN_POINTS) * len(rays) // SEEN_POINTS
+        ends = rays.directions[some] * rays.distances_m[some, None]
+        self._points[index] = ends.cpu().numpy()
         self.set_pose(index, T_map_camera)
         self._losses[index] = self._losses[:index].max() if index else 1.0
         self.stamps_ns.append(stamp_ns)
@@ -148,7 +156,7 @@ class KeyframeStore:
         """Room for the poses and losses of more keyframes."""
         capacity = max(16, 2 * len(self._losses))
         with self._lock:
-            for name in ("_rotations", "_translations", "_losses"):
+            for name in ("_rotations", "_translations", "_losses", "_points"):
                 old = getattr(self, name)
                 array = np.zeros((capacity, *old.shape[1:]), np.float32)
                 array[: len(old)] = old
@@ -175,6 +183,12 @@ class KeyframeStore:
         with self._lock:
             self._rotations[keyframes] = rotations
             self._translations[keyframes] = translations
+
+    def points(self, keyframes: NDArray[np.int64]) -> Floats:
+        """Some surface points (K, P, 3) that each of the keyframes (K,) saw, map frame [m]."""
+        turned = self._points[keyframes] @ self._rotations[keyframes].transpose(0, 2, 1)
+        points: Floats = turned + self._translations[keyframes, None]
+        return points
 
     def drawable(self, keyframes: Sequence[int]) -> NDArray[np.int64]:
         """Those of some keyframes whose rays are in memory, in the same order."""

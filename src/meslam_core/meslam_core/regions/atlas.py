@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from meslam_core.config import MeslamConfig
@@ -15,8 +16,17 @@ from meslam_core.mapping.keyframes import KeyframeStore
 from meslam_core.regions.grid import RegionGrid, RegionIndex
 from meslam_core.regions.observed_mask import ObservedMask
 from meslam_core.regions.region import Region
+from meslam_core.scratch import ScratchFile
+from meslam_core.se3 import inverse
 
 MIN_VISIBLE_SHARE = 0.1
+# Regions whose boxes are so near are awake, though not in training: entering costs nothing then,
+# and a camera that sways at a box's border does not wake and rest it every time [m].
+NEAR_M = 0.3
+# Work that regions bring with them is spread over frames: keyframes read from disk, and views
+# marked in masks, at most so many a frame.
+READ_A_FRAME = 24
+MARKED_A_FRAME = 2
 
 
 @dataclass(frozen=True)
@@ -31,11 +41,15 @@ class RegionChange:
 class RegionAtlas:
     """Distributes networks in space and tracks which of them works.
 
+    Regions lie on a lattice about the working one: where a correction has moved that, so have its
+    neighbours that are yet to come.
+
     Args:
         config: of regions and fields.
         position: (3,) of the first camera in the map frame [m]; the first region's centre.
         keyframes: shared by all regions.
         seed: of the first network's weights.
+        scratch: where regions rest; None keeps all in memory.
     """
 
     def __init__(
@@ -44,15 +58,20 @@ class RegionAtlas:
         position: NDArray[np.floating],
         keyframes: KeyframeStore,
         seed: int,
+        scratch: ScratchFile | None = None,
     ) -> None:
         self.config = config
         self.grid = RegionGrid.around(position, config.regions)
         self.keyframes = keyframes
         self._seed = seed
+        self._scratch = scratch
         self.regions: dict[RegionIndex, Region] = {}
         self._working: RegionIndex = (0, 0, 0)
         self._training: list[RegionIndex] = []
-        self.regions[self._working] = self._new_region(self._working)
+        self._near: list[RegionIndex] = []
+        T_map_region = np.eye(4)
+        T_map_region[:3, 3] = self.grid.center(self._working)
+        self.regions[self._working] = self._new_region(self._working, T_map_region)
 
     @property
     def working(self) -> Region:
@@ -71,22 +90,62 @@ class RegionAtlas:
 
     def update(self, position: NDArray[np.floating]) -> RegionChange:
         """Create, wake and switch regions for a camera at `position` (3,), map frame [m]."""
+        if self.config.regions.single:
+            return RegionChange()
+        position = self._on_lattice(position)
         containing = self.grid.containing(position)
         created = [index for index in containing if index not in self.regions]
         before = set(self._training)
         for index in created:
-            self.regions[index] = self._inherited(index)
+            self.regions[index] = self._neighbour(index)
         changed = False
         past = self.grid.distance_past_middle(position, self._working)
         if past > self.config.regions.hysteresis_m:
             nearest = self.grid.nearest(position)
             if nearest not in self.regions:
-                self.regions[nearest] = self._inherited(nearest)
+                self.regions[nearest] = self._neighbour(nearest)
                 created.append(nearest)
             self._working, changed = nearest, True
         self._training = [index for index in containing if index != self._working]
+        self._near = self.grid.containing(position, NEAR_M)
+        for region in self.active:
+            region.wake()
         woken = tuple(i for i in self._training if i not in before and i not in created)
         return RegionChange(tuple(created), woken, changed)
+
+    def settle(self) -> None:
+        """What an update leaves to be done beside tracking, a portion at a time.
+
+        Regions near the camera wake, those that were left rest; the keyframes that the active ones
+        train on come into memory, all others leave it; masks show what was not marked yet.
+        """
+        kept = self.active
+        for index in self._near:
+            region = self.regions.get(index)
+            if region is not None and all(region is not each for each in kept):
+                region.wake()
+                kept.append(region)
+        self._rest_except(kept)
+        for region in kept:
+            self._meet(region)
+        wanted = [k for region in reversed(kept) for k in region.keyframes]
+        self.keyframes.storage.hold(wanted, READ_A_FRAME)
+        left = MARKED_A_FRAME
+        for region in kept:
+            portion = region.unmarked[:left]
+            for keyframe in portion:
+                self.observe(region, keyframe)
+            del region.unmarked[: len(portion)]
+            left -= len(portion)
+
+    @contextmanager
+    def awake(self, region: Region) -> Iterator[Region]:
+        """One region with all its keyframes in memory, for work that goes region by region."""
+        region.wake()
+        self._rest_except([region, *self.active])
+        self._meet(region)
+        self.keyframes.storage.hold(region.keyframes, len(region.keyframes))
+        yield region
 
     def add_keyframe(self, keyframe: int) -> None:
         """Give a new keyframe to every active region and mark what it observed."""
@@ -97,29 +156,31 @@ class RegionAtlas:
     def observe(self, region: Region, keyframe: int) -> None:
         """Mark in a region's mask what a keyframe saw."""
         rays = self.keyframes.all_rays(keyframe)
-        rotation = self.keyframes.rotations[keyframe]
-        origin = self.keyframes.translations[keyframe].cpu().numpy().astype(np.float64)
-        directions = (rays.directions @ rotation.T).cpu().numpy()
-        axes = region.T_map_region[:3, :3]
+        T_region_camera = inverse(region.T_map_region) @ self.keyframes.pose(keyframe)
+        directions = rays.directions.cpu().numpy() @ T_region_camera[:3, :3].T.astype(np.float32)
         region.mask.integrate(
-            (origin - region.T_map_region[:3, 3]) @ axes,
-            directions @ axes,
+            T_region_camera[:3, 3],
+            directions,
             rays.distances_m.cpu().numpy(),
-            region.field.config.truncation_m,
+            region.field_config.truncation_m,
         )
 
-    def rebuild_masks(self) -> None:
-        """Mark the observed space anew from the refined keyframe poses."""
-        for region in self.regions.values():
-            region.mask.clear()
-            for keyframe in region.keyframes:
-                self.observe(region, keyframe)
+    def rebuild_mask(self, region: Region) -> bool:
+        """Mark the observed space anew from the refined keyframe poses; whether it changed."""
+        before = region.mask.flags.copy()
+        region.mask.clear()
+        for keyframe in region.keyframes:
+            self.observe(region, keyframe)
+        region.unmarked.clear()
+        return not np.array_equal(region.mask.flags, before)
 
-    def _new_region(self, index: RegionIndex) -> Region:
-        T_map_region = np.eye(4)
-        T_map_region[:3, 3] = self.grid.center(index)
-        half_side = 0.5 * self.grid.side_m
-        extent = self.config.regions.mask_extent * half_side
+    def _on_lattice(self, position: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Where a position (3,) would be if no correction had moved the working region [m]."""
+        local = inverse(self.working.T_map_region) @ np.append(position, 1.0)
+        return np.asarray(self.grid.center(self._working) + local[:3], np.float64)
+
+    def _new_region(self, index: RegionIndex, T_map_region: NDArray[np.float64]) -> Region:
+        extent = self.config.regions.mask_extent * 0.5 * self.grid.side_m
         return Region(
             index=index,
             T_map_region=T_map_region,
@@ -128,25 +189,63 @@ class RegionAtlas:
             mask=ObservedMask(extent, self.config.regions.mask_voxel_m),
         )
 
-    def _inherited(self, index: RegionIndex) -> Region:
-        """A new region that continues the working region's map exactly, and its replay."""
-        parent, region = self.working, self._new_region(index)
-        offset = (region.T_map_region - parent.T_map_region)[:3, 3] / parent.half_side_m
-        region.field.load_flat(shifted(parent.field.flat(), self.config.field.embedding, offset))
-        region.keyframes = [k for k in parent.keyframes if self._sees(region, k)]
+    def _neighbour(self, index: RegionIndex) -> Region:
+        """A new region that continues the working region's map, and its replay."""
+        parent = self.working
+        parent.wake()
+        steps = self.grid.center(index) - self.grid.center(parent.index)
+        T_map_region = parent.T_map_region.copy()
+        T_map_region[:3, 3] += T_map_region[:3, :3] @ steps
+        region = self._new_region(index, T_map_region)
+        self._initialise(region, parent, steps)
+        region.keyframes = self._seeing(region, range(len(self.keyframes)))
         region.keyframes = region.keyframes or parent.keyframes[-1:]
-        for keyframe in region.keyframes:
-            self.observe(region, keyframe)
+        region.seen = len(self.keyframes)
+        known = set() if self.config.regions.initialisation == "random" else set(parent.keyframes)
+        region.unmarked = [k for k in region.keyframes if k not in known]
         return region
 
-    def _sees(self, region: Region, keyframe: int) -> bool:
-        """Whether a keyframe was taken in a region's box or sees a good part of it."""
-        center = torch.from_numpy(region.T_map_region[:3, 3]).float()
-        position = self.keyframes.translations[keyframe].cpu()
-        if bool(((position - center).abs() < region.half_side_m).all()):
-            return True
-        rays = self.keyframes.all_rays(keyframe).to(torch.device("cpu"))
-        rotation = self.keyframes.rotations[keyframe].cpu()
-        ends = position + (rays.directions * rays.distances_m[:, None]) @ rotation.T
-        inside = ((ends - center).abs() < region.half_side_m).all(dim=1)
-        return float(inside.float().mean()) > MIN_VISIBLE_SHARE
+    def _initialise(self, region: Region, parent: Region, steps: NDArray[np.float64]) -> None:
+        """The network of a region whose centre lies `steps` (3,) from its parent's [m]."""
+        how = self.config.regions.initialisation
+        if how == "random":
+            return
+        weights = parent.field.flat()
+        if how == "continued":
+            offset = steps / parent.half_side_m
+            weights = shifted(weights, self.config.field.embedding, offset)
+        # The network answers as the parent's does, so it has seen as much.
+        region.mask.flags[:] = parent.mask.moved(steps).flags
+        region.field.load_flat(weights)
+        region.field.load_optimizer_state(*parent.field.optimizer_state())
+
+    def _meet(self, region: Region) -> None:
+        """Give a region the keyframes that saw it while it was at rest."""
+        count = len(self.keyframes)
+        if region.seen < count:
+            known = set(region.keyframes)
+            found = self._seeing(region, range(region.seen, count))
+            found = [k for k in found if k not in known]
+            if found:
+                region.unmarked += found
+                region.keyframes = sorted([*region.keyframes, *found])
+            region.seen = count
+
+    def _seeing(self, region: Region, keyframes: Iterable[int]) -> list[int]:
+        """Those keyframes that were taken in a region's box or see a good part of it."""
+        numbers = np.array(list(keyframes), np.int64)
+        if not len(numbers):
+            return []
+        T = inverse(region.T_map_region)
+        positions = self.keyframes.pose_arrays()[1][numbers] @ T[:3, :3].T + T[:3, 3]
+        inside = (np.abs(positions) < region.half_side_m).all(axis=1)
+        points = self.keyframes.points(numbers) @ T[:3, :3].T + T[:3, 3]
+        seen = (np.abs(points) < region.half_side_m).all(axis=2).mean(axis=1)
+        return [int(k) for k in numbers[inside | (seen > MIN_VISIBLE_SHARE)]]
+
+    def _rest_except(self, kept: list[Region]) -> None:
+        if self._scratch is None:
+            return
+        for region in self.regions.values():
+            if not any(region is each for each in kept):
+                region.rest(self._scratch)

@@ -47,10 +47,17 @@ class RegionGrid:
         steps = np.rint((np.asarray(position) - self.origin) / self.spacing_m).astype(int)
         return (int(steps[0]), int(steps[1]), int(steps[2]))
 
-    def containing(self, position: NDArray[np.floating]) -> list[RegionIndex]:
-        """All regions whose box contains a position: one, or up to eight in intersections."""
+    def containing(
+        self, position: NDArray[np.floating], margin_m: float = 0.0
+    ) -> list[RegionIndex]:
+        """All regions whose box contains a position: one, or up to eight in intersections.
+
+        Args:
+            position: (3,) [m].
+            margin_m: by so much the boxes are taken larger on all sides [m].
+        """
         relative = (np.asarray(position, np.float64) - self.origin) / self.spacing_m
-        reach = 0.5 * self.side_m / self.spacing_m
+        reach = (0.5 * self.side_m + margin_m) / self.spacing_m
         candidates = [
             range(int(np.ceil(value - reach)), int(np.floor(value + reach)) + 1)
             for value in relative

@@ -93,6 +93,20 @@ class ObservedMask:
         """Volume of the observed voxels [m^3]."""
         return float(np.count_nonzero(self.flags & OBSERVED)) * self.voxel_m**3
 
+    def moved(self, offset_m: NDArray[np.floating]) -> ObservedMask:
+        """The same observations about a centre moved by (3,) [m], to the nearest voxel.
+
+        What lies outside the moved cube is forgotten.
+        """
+        count = self.flags.shape[0]
+        steps = np.rint(np.asarray(offset_m) / self.voxel_m).astype(int)
+        mask = ObservedMask.from_flags(np.zeros_like(self.flags), self.voxel_m)
+        steps = np.clip(steps, -count, count)
+        here = tuple(slice(max(0, -s), min(count, count - s)) for s in steps)
+        there = tuple(slice(max(0, s), min(count, count + s)) for s in steps)
+        mask.flags[here] = self.flags[there]
+        return mask
+
     def clear(self) -> None:
         """Forget everything."""
         self.flags[:] = 0

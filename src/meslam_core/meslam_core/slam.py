@@ -104,10 +104,10 @@ class Slam:
         self.config = config
         self.device = field_device(config.field)
         kept = config.keyframes
+        self._scratch = ScratchFile(config.runtime.work_dir)
         # One network needs all its keyframes, always.
-        single, folder = config.regions.single, config.runtime.work_dir
-        self._scratch = None if single else ScratchFile(folder)
-        self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed, self._scratch)
+        rays_rest = None if config.regions.single else self._scratch
+        self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed, rays_rest)
         self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
         self.policy = KeyframePolicy(config.keyframes, config.field)
         self.tracking = FrameTracking(config.tracking)
@@ -120,7 +120,7 @@ class Slam:
         self._worker = TrainingWorker()
         self._linker: CovisibilityLinker | None = None
         if config.keyframes.links:
-            self._linker = CovisibilityLinker(self.keyframes, config)
+            self._linker = CovisibilityLinker(self.keyframes, config, self._scratch)
         self._trained: list[Region] = []
         self._latest_training = Training()
         self._steps_owed = 0

@@ -13,9 +13,11 @@ from meslam_core.camera import PinholeCamera
 from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.mapping import covisibility
-from meslam_core.mapping.covisibility import DEPTH_UNIT_M, CovisibilityLinker, KeyframeImage
+from meslam_core.mapping.covisibility import CovisibilityLinker
+from meslam_core.mapping.keyframe_images import DEPTH_UNIT_M, KeyframeImage
 from meslam_core.mapping.keyframes import KeyframeStore, rays_at
 from meslam_core.odometry.registration import Registration
+from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose, exp, inverse, log
 from meslam_core.tracking.pixels import choose_pixels
 
@@ -38,7 +40,7 @@ class Mapper:
     def __init__(self, *overrides: str) -> None:
         config = MeslamConfig.from_overrides(["keyframes.rays=512", *overrides])
         self.keyframes = KeyframeStore(config.keyframes.rays, torch.device("cpu"))
-        self.linker = CovisibilityLinker(self.keyframes, config)
+        self.linker = CovisibilityLinker(self.keyframes, config, ScratchFile())
         self._generator = np.random.default_rng(0)
 
     def add(self, pose: Pose, believed: Pose | None = None):
@@ -199,17 +201,17 @@ def test_a_registration_that_fails_ties_nothing(monkeypatch):
     assert links_by(Failing(), monkeypatch) == []
 
 
-def test_few_images_are_kept_the_newest_and_different_views_among_them(monkeypatch):
-    monkeypatch.setattr(covisibility, "MAX_IMAGES", 5)
+def test_views_are_found_again_after_many_others(monkeypatch):
+    monkeypatch.setattr(covisibility, "make_registrar", lambda odometry, sensor: Scripted())
+    mapper = Mapper("keyframes.links=2")
+    mapper.add(START)
+    mapper.add_all([AWAY @ exp(np.array([0.0, 0.01 * n, 0.0, 0.0, 0.0, 0.0])) for n in range(30)])
+    assert [link.first for link in mapper.add(RETURN)] == [0]
+
+
+def test_a_camera_behind_walls_that_looks_the_same_way_is_not_tried(monkeypatch):
     monkeypatch.setattr(covisibility, "make_registrar", lambda odometry, sensor: Scripted())
     mapper = Mapper()
-    mapper.add(AWAY)
-    for number, pose in enumerate(path(12, step_m=0.02), start=1):
-        mapper.add(pose)
-        kept = set(mapper.linker._images)
-        assert len(kept) == min(number + 1, 5)
-        assert number in kept
-        # No other view can stand for this one.
-        assert 0 in kept
-    # What remains is spread over the path instead of crowded at its end.
-    assert min(kept - {0}) <= 4
+    # Everything that the camera sees now projects into the image of one 6 m behind.
+    mapper.add(START, START @ exp(np.array([0.0, 0.0, -6.0, 0.0, 0.0, 0.0])))
+    assert mapper.add(RETURN) == []

@@ -10,15 +10,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
+from meslam_core.mapping.keyframe_images import KeyframeImage, KeyframeImages
 from meslam_core.mapping.keyframes import KeyframeStore, Rays
 from meslam_core.odometry import make_registrar
+from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose, inverse, rotation_angle
 
 # Points of the new keyframe by which an overlap is judged.
@@ -30,67 +30,6 @@ MIN_AGREEMENT = 0.3
 # A registration farther from where the keyframes are believed to be is not believed itself.
 MAX_CORRECTION_M = 0.15
 MAX_CORRECTION_RAD = 0.12
-# Images of more keyframes are not kept: of the two most alike, the older ones go.
-MAX_IMAGES = 200
-# An angle of 1 rad makes views as different as this distance does [m].
-RADIAN_AS_M = 1.0
-# Depths that differ by more than this share lie on different surfaces.
-SAME_SURFACE = 0.03
-DEPTH_UNIT_M = 0.0005
-
-
-@dataclass(frozen=True)
-class KeyframeImage:
-    """What a later registration needs of a keyframe, in little memory.
-
-    Attributes:
-        gray: (H, W) uint8.
-        depth: (H, W) uint16 in units of `DEPTH_UNIT_M`.
-        camera: intrinsics of this resolution.
-        stamp_ns: of the image [ns].
-    """
-
-    gray: NDArray[np.uint8]
-    depth: NDArray[np.uint16]
-    camera: PinholeCamera
-    stamp_ns: int
-
-    @classmethod
-    def of(cls, frame: RgbdFrame, width: int) -> KeyframeImage:
-        """A frame's image, halved until it is at most `width` wide."""
-        gray = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)
-        depth, camera = np.nan_to_num(frame.depth_m, posinf=0.0, neginf=0.0), frame.camera
-        while camera.width > width and min(camera.width, camera.height) > 16:
-            half = (camera.width // 2, camera.height // 2)
-            even = gray[: 2 * half[1], : 2 * half[0]]
-            gray = np.asarray(cv2.resize(even, half, interpolation=cv2.INTER_AREA), np.uint8)
-            depth = _halved_depth(depth[: 2 * half[1], : 2 * half[0]])
-            camera = PinholeCamera(
-                *half,
-                camera.fx / 2,
-                camera.fy / 2,
-                (camera.cx - 0.5) / 2,
-                (camera.cy - 0.5) / 2,
-            )
-        units = np.clip(np.rint(depth / DEPTH_UNIT_M), 0, np.iinfo(np.uint16).max)
-        return cls(gray, units.astype(np.uint16), camera, frame.stamp_ns)
-
-    def frame(self) -> RgbdFrame:
-        """The image pair, without colours."""
-        color = np.ascontiguousarray(np.broadcast_to(self.gray[..., None], (*self.gray.shape, 3)))
-        depth_m = self.depth * np.float32(DEPTH_UNIT_M)
-        return RgbdFrame(self.stamp_ns, color, depth_m, self.camera)
-
-
-def _halved_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mean of each 2x2 block's depths on the nearest surface; 0 where there is none."""
-    height, width = depth_m.shape
-    corners = depth_m.reshape(height // 2, 2, width // 2, 2).swapaxes(1, 2)
-    blocks = corners.reshape(height // 2, width // 2, 4)
-    nearest = np.where(blocks > 0, blocks, np.inf).min(axis=2, keepdims=True)
-    same = (blocks > 0) & (blocks < nearest * (1.0 + SAME_SURFACE))
-    count = same.sum(axis=2)
-    return np.asarray((blocks * same).sum(axis=2) / np.maximum(count, 1), np.float32)
 
 
 @dataclass(frozen=True)
@@ -113,9 +52,12 @@ class CovisibilityLinker:
     Args:
         keyframes: whose poses tell what overlaps.
         config: number of links a keyframe, and of the registration.
+        scratch: where the keyframes' images lie.
     """
 
-    def __init__(self, keyframes: KeyframeStore, config: MeslamConfig) -> None:
+    def __init__(
+        self, keyframes: KeyframeStore, config: MeslamConfig, scratch: ScratchFile
+    ) -> None:
         self._keyframes = keyframes
         self._links = config.keyframes.links
         self._width = config.odometry.image_width
@@ -123,7 +65,8 @@ class CovisibilityLinker:
         # are alike in all, do not: here the images count in full.
         odometry = replace(config.odometry, luma_bias_m=0.0, luma_bias_deg=0.0)
         self._registrar = make_registrar(odometry, config.sensor)
-        self._images: dict[int, KeyframeImage] = {}
+        self._reach_m = config.sensor.max_depth_m
+        self._images = KeyframeImages(scratch)
 
     def link(self, keyframe: int, frame: RgbdFrame, rays: Rays) -> list[CovisibilityLink]:
         """Register a new keyframe with up to `config.links` older ones.
@@ -138,9 +81,7 @@ class CovisibilityLinker:
             self._candidates(keyframe, frame.camera, rays), ATTEMPTS_A_LINK * self._links
         )
         links = self._register_all(keyframe, image, older)
-        self._images[keyframe] = image
-        if len(self._images) > MAX_IMAGES:
-            self._forget_one()
+        self._images.add(keyframe, image)
         return links
 
     def _register_all(
@@ -159,7 +100,7 @@ class CovisibilityLinker:
     def _register(self, older: int, keyframe: int, prepared: object) -> Pose | None:
         """T_older_new (4, 4) where the two fit; None where not."""
         guess = inverse(self._keyframes.pose(older)) @ self._keyframes.pose(keyframe)
-        target = self._registrar.prepare(self._images[older].frame())
+        target = self._registrar.prepare(self._images.get(older).frame())
         try:
             found = self._registrar.register(prepared, target, guess)
         except RuntimeError:
@@ -177,14 +118,18 @@ class CovisibilityLinker:
         step = max(1, len(rays) // JUDGED_POINTS)
         points = (rays.directions[::step] * rays.distances_m[::step, None]).numpy()
         points = points @ pose[:3, :3].T + pose[:3, 3]
-        numbers = np.array(list(self._images), np.int64)
+        numbers = self._images.numbers
+        rotations, translations = self._keyframes.pose_arrays()
+        # Two cameras farther apart measure no point in common.
+        apart = np.linalg.norm(translations[numbers] - pose[:3, 3].astype(np.float32), axis=1)
+        numbers = numbers[apart < 2.0 * self._reach_m]
         if not len(numbers):
             return
-        rotations, translations = self._keyframes.pose_arrays()
         moved = points[None] - translations[numbers, None]
         moved = np.einsum("kji,knj->kni", rotations[numbers], moved)
         u, v, z = camera.project(moved.reshape(-1, 3))
-        inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        inside = (z > 0) & (z < self._reach_m)
+        inside &= (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         overlap = inside.reshape(len(numbers), -1).mean(axis=1)
         seen = numbers[overlap > MIN_OVERLAP]
         best = numbers[np.argsort(-overlap, kind="stable")][: len(seen)]
@@ -194,14 +139,3 @@ class CovisibilityLinker:
                 if int(number) not in given:
                     given.add(int(number))
                     yield int(number)
-
-    def _forget_one(self) -> None:
-        """Drop an image that another one can stand for."""
-        numbers = np.sort(np.array(list(self._images), np.int64))
-        rotations, translations = self._keyframes.pose_arrays()
-        axes, positions = rotations[numbers, :, 2], translations[numbers]
-        apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-        apart += RADIAN_AS_M * np.linalg.norm(axes[:, None] - axes[None], axis=2)
-        apart[np.tril_indices(len(numbers))] = np.inf
-        older, _ = np.unravel_index(np.argmin(apart), apart.shape)
-        del self._images[int(numbers[older])]

@@ -4,8 +4,10 @@ import hashlib
 import json
 import struct
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import data
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -68,6 +70,25 @@ def test_everything_but_the_weights_is_exact(small_region: StoredRegion, precisi
     assert_same_but_weights(codec.decode(codec.encode(small_region, precision)), small_region)
 
 
+def test_bytes_written_once_mean_the_same_for_ever_and_everywhere() -> None:
+    stored = Path(data.__path__[0], "region_v1.msr").read_bytes()
+    region = codec.decode(stored)
+    assert (region.index, region.version, region.keyframes) == ((1, -2, 3), 4, 9)
+    weights = hashlib.sha256(region.parameters.astype("<f4").tobytes()).hexdigest()
+    assert weights == "4d4b55a806876f2ff71753dbf955a6877b84d7a9f88ec4959d72b2e867345c34"
+    mask = hashlib.sha256(region.mask.flags.tobytes()).hexdigest()
+    assert mask == "a940b3dfe03cd4374ea1241e2eaaecc146bc55a364cfdf9e40e0726bdb4d8861"
+    assert codec.precision_of(stored) == "int8"
+
+
+def test_another_place_for_the_same_region(small_region: StoredRegion) -> None:
+    for precision in PRECISIONS:
+        there = codec.encode(small_region, precision)
+        moved = codec.with_index(there, (7, 0, 0))
+        assert codec.decode(moved).index == (7, 0, 0)
+        assert codec.with_index(moved, small_region.index) == there
+
+
 @pytest.mark.parametrize(("precision", "change_mm"), [("int8", 0.9), ("fp16", 0.05)])
 def test_quantised_map_stays_close(
     region: StoredRegion, scene: SphereInRoom, precision: str, change_mm: float
@@ -82,15 +103,15 @@ def test_quantised_map_stays_close(
     moved_mm = np.abs(after[:, 0] - before[:, 0]).mean() * 100.0
     error_before, error_after = (np.abs(v[:, 0] - truth).mean() * 100.0 for v in (before, after))
     assert moved_mm < change_mm
-    assert error_after < error_before + 0.1
+    assert error_after < error_before + 0.15
     assert np.abs(after[:, 1:] - before[:, 1:]).mean() < 0.004
 
 
 @pytest.mark.parametrize(
-    ("precision", "weights_bytes"), [("int8", 26_700), ("fp16", 49_000), ("fp32", 96_500)]
+    ("precision", "weights_bytes"), [("int8", 25_400), ("fp16", 48_500), ("fp32", 95_800)]
 )
 def test_size(region: StoredRegion, precision: str, weights_bytes: int) -> None:
-    mask_bytes = 1_000
+    mask_bytes = 800
     assert len(codec.encode(region, precision)) < weights_bytes + mask_bytes
 
 
@@ -118,15 +139,26 @@ def test_weights_are_one_float32_product_as_the_format_says(region: StoredRegion
     assert np.array_equal(np.concatenate(parts), codec.decode(data).parameters)
 
 
-def test_quantised_row_of_zeros_and_tiny_rows() -> None:
-    rows = np.zeros((3, 4), np.float32)
-    rows[1] = 1e-44
-    rows[2] = [1e-30, -1e-30, 0.0, 5e-31]
-    tensors = codec._quantized("w", rows, np.int8, rows.shape)
-    back = tensors["w"].astype(np.float32) * tensors["w.scale"][:, None]
-    assert np.array_equal(back[0], np.zeros(4))
-    assert np.isfinite(back).all()
-    assert np.allclose(back[2], rows[2], atol=1e-32)
+def test_rows_of_zeros_tiny_rows_and_huge_rows(small_region: StoredRegion) -> None:
+    parameters = small_region.parameters.copy()
+    rows = parameters[32:160].reshape(16, 8)
+    rows[0], rows[1], rows[2], rows[3] = 0.0, 1e-44, 1e-30, np.linspace(-3e6, 3e6, 8)
+    data = codec.encode(replace(small_region, parameters=parameters))
+    decoded = codec.decode(data)
+    back = decoded.parameters[32:160].reshape(16, 8)
+    assert np.array_equal(back[0], np.zeros(8))
+    assert np.abs(back[1:3]).max() < 1e-6
+    assert np.allclose(back[3], rows[3], atol=3e6 / 127)
+    assert codec.encode(decoded) == data
+
+
+def test_trained_rows_are_quantised_anew_and_others_kept(small_region: StoredRegion) -> None:
+    first = codec.decode(codec.encode(small_region))
+    trained = first.parameters.copy()
+    trained[32] += np.float32(0.123)
+    second = codec.decode(codec.encode(replace(first, parameters=trained)))
+    assert np.array_equal(second.parameters[40:160], first.parameters[40:160])
+    assert second.parameters[32] == pytest.approx(trained[32], abs=0.03)
 
 
 def test_phases_may_have_grown_by_whole_turns(region: StoredRegion) -> None:
@@ -234,10 +266,16 @@ def test_data_behind_the_compressed_frame(small_region: StoredRegion) -> None:
         ("layer1.bias", np.full(16, np.nan, np.float16)),
         ("layer1.bias", np.zeros(16, np.float64)),
         ("layer1.bias.scale", np.ones(16, np.float32)),
-        ("mask", None),
-        ("mask", np.zeros((9, 1, 1), np.uint8)),
-        ("mask", np.full((2, 2, 2), 4, np.uint8)),
-        ("mask", np.zeros((2, 2), np.uint8)),
+        ("mask.near", None),
+        ("mask.observed", None),
+        ("mask.observed", np.zeros(3, np.uint8)),
+        ("mask.observed", np.zeros((2, 2), np.uint8)),
+        ("mask.near", np.zeros(2, np.int8)),
+        ("mask.near.counts", None),
+        ("mask.near.counts", np.array([9, *[0] * 9], np.uint32)),
+        ("mask.observed.counts", np.array([18, *[0] * 9], np.uint32)),
+        ("mask.observed.counts", np.full(10, 2**32 - 1, np.uint32)),
+        ("mask.observed.counts", np.zeros(10, np.int64)),
         ("extra", np.zeros(3, np.float32)),
     ],
 )
@@ -274,6 +312,10 @@ def test_lying_tensors(small_region: StoredRegion, name: str, tensor: np.ndarray
         ("mask.count", 7),
         ("mask.corner", [7, 0, 0]),
         ("mask.corner", [-1, 0, 0]),
+        ("mask.shape", [9, 1, 1]),
+        ("mask.shape", [3, 3, 2]),
+        ("mask.shape", [448, 448, 448]),
+        ("mask.shape", [-1, 3, 1]),
         ("mask", []),
         ("architecture", None),
     ],

@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from typing import Any
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import safetensors
@@ -19,14 +20,15 @@ import zstandard
 from numpy.typing import NDArray
 
 from meslam_core.errors import MapError
-from meslam_core.field.network import parameter_shapes
+from meslam_core.map.mask_code import CLASSES, CodedBits, decode_mask, encode_mask
 from meslam_core.map.metadata import MAX_MASK_COUNT, PRECISIONS, Metadata
-from meslam_core.map.stored_region import Architecture, StoredRegion
-from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED, ObservedMask
+from meslam_core.map.stored_region import StoredRegion
+from meslam_core.map.weights import Tensors, weights_from_tensors, weights_to_tensors
+from meslam_core.regions.grid import RegionIndex
+from meslam_core.regions.observed_mask import ObservedMask
 
 FORMAT = "meslam-region/1"
 FORMAT_VERSION = 1
-PHASE_LIMIT = 3.1416  # a little above pi, so that quantised phases stay as they are
 
 MAX_FILE_BYTES = 64 << 20
 MAX_CONTENT_BYTES = 96 << 20
@@ -35,12 +37,10 @@ _MAGIC = b"MESLAMRG"
 _HEADER = struct.Struct("<8sIIQQ32s")
 _CHECKED_HEADER_BYTES = _HEADER.size - 32
 _LEVEL = 19
+_LARGE = 1024
 _METADATA_KEY = "meslam"
-_SCALE = ".scale"
-_MASK = "mask"
-_ENCODING = ("encoding.frequencies", "encoding.phases")
-
-Tensors = dict[str, NDArray[Any]]
+_PLANES = ("mask.observed", "mask.near")
+_COUNTS = ".counts"
 
 
 def encode(region: StoredRegion, precision: str = "int8") -> bytes:
@@ -67,17 +67,12 @@ def encode(region: StoredRegion, precision: str = "int8") -> bytes:
     if not np.isfinite(region.parameters).all():
         raise MapError(f"{name}: weights are not finite, so there is nothing to store")
     corner, flags = _cropped(region.mask.flags)
-    tensors = _weights_to_tensors(region, precision, name)
-    tensors[_MASK] = flags
-    metadata = Metadata.of(region, precision, corner)
+    metadata = Metadata.of(region, precision, corner, flags.shape)
     metadata.check(name)
-    content = safetensors.numpy.save(tensors, {_METADATA_KEY: metadata.to_json()})
-    if len(content) > MAX_CONTENT_BYTES:
-        raise MapError(f"{name}: {len(content)} bytes are more than the format's maximum")
-    payload = zstandard.ZstdCompressor(level=_LEVEL).compress(content)
-    head = _HEADER.pack(_MAGIC, FORMAT_VERSION, 0, len(payload), len(content), b"")
-    head = head[:_CHECKED_HEADER_BYTES]
-    return head + hashlib.sha256(head + payload).digest() + payload
+    tensors = weights_to_tensors(region, precision, name)
+    for plane, coded in zip(_PLANES, encode_mask(flags), strict=True):
+        tensors |= {plane: coded.packed, plane + _COUNTS: coded.counts}
+    return _sealed(safetensors.numpy.save(tensors, {_METADATA_KEY: metadata.to_json()}), name)
 
 
 def decode(data: bytes, name: str = "region") -> StoredRegion:
@@ -93,7 +88,7 @@ def decode(data: bytes, name: str = "region") -> StoredRegion:
     content = _content(data, name)
     tensors, metadata = _parsed(content, name)
     architecture = metadata.architecture
-    parameters = _weights_from_tensors(tensors, architecture, name)
+    parameters = weights_from_tensors(tensors, architecture, name)
     mask = _mask(tensors, metadata, name)
     if tensors:
         raise MapError(f"{name}: unexpected tensor {min(tensors)!r}; the content is damaged")
@@ -113,6 +108,36 @@ def decode(data: bytes, name: str = "region") -> StoredRegion:
 def precision_of(data: bytes, name: str = "region") -> str:
     """How the weights in encoded bytes are stored; raises as `decode`."""
     return _parsed(_content(data, name), name)[1].precision
+
+
+def with_index(data: bytes, index: RegionIndex) -> bytes:
+    """The same region, bit for bit, at another place on the lattice; raises as `decode`."""
+    return encode(replace(decode(data), index=index), precision_of(data))
+
+
+def _sealed(content: bytes, name: str) -> bytes:
+    """Content compressed behind a header with its checksum."""
+    if len(content) > MAX_CONTENT_BYTES:
+        raise MapError(f"{name}: {len(content)} bytes are more than the format's maximum")
+    packer = zstandard.ZstdCompressor(level=_LEVEL).compressobj(size=len(content))
+    # Each large tensor is a block of its own, for its values are distributed in their own way.
+    bounds = [0, *_large_tensors(content), len(content)]
+    pieces = [
+        packer.compress(content[start:end]) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+        for start, end in pairwise(bounds)
+    ]
+    payload = b"".join(pieces) + packer.flush()
+    head = _HEADER.pack(_MAGIC, FORMAT_VERSION, 0, len(payload), len(content), b"")
+    head = head[:_CHECKED_HEADER_BYTES]
+    return head + hashlib.sha256(head + payload).digest() + payload
+
+
+def _large_tensors(content: bytes) -> list[int]:
+    """Where the large tensors of a safetensors file begin."""
+    start = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:start])
+    spans = [tensor["data_offsets"] for key, tensor in header.items() if key != "__metadata__"]
+    return sorted(start + first for first, end in spans if end - first >= _LARGE)
 
 
 def _content(data: bytes, name: str) -> bytes:
@@ -182,82 +207,23 @@ def _cropped(flags: NDArray[np.uint8]) -> tuple[tuple[int, int, int], NDArray[np
 
 
 def _mask(tensors: Tensors, metadata: Metadata, name: str) -> ObservedMask:
-    flags = tensors.pop(_MASK, np.zeros(0))
-    corner, count = metadata.mask_corner, metadata.mask_count
-    fits = flags.ndim == 3 and all(
-        low + size <= count for low, size in zip(corner, flags.shape, strict=True)
-    )
-    if flags.dtype != np.uint8 or not fits:
-        raise MapError(f"{name}: the observed mask is missing or does not fit its cube")
-    if flags.size and flags.max() > OBSERVED | NEAR_SURFACE:
-        raise MapError(f"{name}: the observed mask holds flags that do not exist")
+    corner, shape, count = metadata.mask_corner, metadata.mask_shape, metadata.mask_count
+    if any(low + size > count for low, size in zip(corner, shape, strict=True)):
+        raise MapError(f"{name}: the observed mask does not fit its cube")
+    planes = [_coded_bits(tensors, plane, name) for plane in _PLANES]
     whole = np.zeros((count, count, count), np.uint8)
-    box = tuple(slice(low, low + size) for low, size in zip(corner, flags.shape, strict=True))
-    whole[box] = flags
+    box = tuple(slice(low, low + size) for low, size in zip(corner, shape, strict=True))
+    try:
+        whole[box] = decode_mask(planes[0], planes[1], shape)
+    except MapError as error:
+        raise MapError(f"{name}: {error}") from error
     return ObservedMask.from_flags(whole, metadata.mask_voxel_m)
 
 
-def _weights_to_tensors(region: StoredRegion, precision: str, name: str) -> Tensors:
-    tensors: Tensors = {}
-    start = 0
-    shapes = parameter_shapes(region.architecture.width, region.architecture.embedding)
-    for key, shape in shapes.items():
-        size = int(np.prod(shape))
-        values = region.parameters[start : start + size].reshape(shape).astype(np.float32)
-        start += size
-        if precision == "fp32":
-            tensors[key] = values
-        elif key in _ENCODING:
-            if key == "encoding.phases":
-                turned = np.remainder(values.astype(np.float64) + np.pi, 2 * np.pi) - np.pi
-                values = np.where(np.abs(values) > PHASE_LIMIT, turned, values).astype(np.float32)
-            tensors |= _quantized(key, values.reshape(1, -1), np.int16, shape)
-        elif precision == "int8" and len(shape) == 2:
-            tensors |= _quantized(key, values, np.int8, shape)
-        else:
-            with np.errstate(over="ignore"):
-                tensors[key] = values.astype(np.float16)
-            if not np.isfinite(tensors[key]).all():
-                raise MapError(f"{name}: weights are too large for {precision}; store fp32")
-    return tensors
-
-
-def _quantized(key: str, rows: NDArray[np.float32], kind: type, shape: tuple[int, ...]) -> Tensors:
-    """Integers and a float32 scale a row.
-
-    Scales are rounded up to few bits of mantissa (16 for int8, a power of two for int16), so
-    that integer times scale is exact in float32 and encoding a decoded region again gives the
-    same bytes.
-    """
-    limit = float(np.iinfo(kind).max)
-    mantissa, exponent = np.frexp(np.abs(rows).max(axis=1).astype(np.float64) / limit)
-    steps = 2.0**16 if kind is np.int8 else 1.0
-    scale = np.ldexp(np.ceil(mantissa * steps) / steps, exponent).astype(np.float32)
-    divisor = np.where(scale > 0, scale, np.float32(1)).astype(np.float64)
-    integers: NDArray[Any] = np.clip(np.rint(rows / divisor[:, None]), -limit, limit).astype(kind)
-    return {key: integers.reshape(shape), key + _SCALE: scale}
-
-
-def _weights_from_tensors(
-    tensors: Tensors, architecture: Architecture, name: str
-) -> NDArray[np.float32]:
-    """The flat vector; one float32 product a weight, so that every machine gets the same bits."""
-    parts = []
-    for key, shape in parameter_shapes(architecture.width, architecture.embedding).items():
-        stored, scale = tensors.pop(key, None), tensors.pop(key + _SCALE, None)
-        if stored is None or stored.shape != shape:
-            raise MapError(f"{name}: tensor {key!r} is missing or not of shape {shape}")
-        values = stored.astype(np.float32)
-        if stored.dtype in (np.int8, np.int16):
-            rows = values.reshape(1 if key in _ENCODING else shape[0], -1)
-            if scale is None or scale.dtype != np.float32 or scale.shape != (len(rows),):
-                raise MapError(f"{name}: tensor {key + _SCALE!r} is missing or malformed")
-            with np.errstate(invalid="ignore", over="ignore"):  # checked below
-                values = rows * scale[:, None]
-        elif stored.dtype not in (np.float16, np.float32) or scale is not None:
-            raise MapError(f"{name}: tensor {key!r} has an unknown type {stored.dtype}")
-        parts.append(values.reshape(-1))
-    parameters = np.concatenate(parts)
-    if not np.isfinite(parameters).all():
-        raise MapError(f"{name}: weights are not finite; the content is damaged")
-    return parameters
+def _coded_bits(tensors: Tensors, plane: str, name: str) -> CodedBits:
+    packed, counts = tensors.pop(plane, None), tensors.pop(plane + _COUNTS, None)
+    if packed is None or packed.dtype != np.uint8 or packed.ndim != 1:
+        raise MapError(f"{name}: tensor {plane!r} is missing or malformed")
+    if counts is None or counts.dtype != np.uint32 or counts.shape != (CLASSES,):
+        raise MapError(f"{name}: tensor {plane + _COUNTS!r} is missing or malformed")
+    return CodedBits(counts, packed)

@@ -36,10 +36,15 @@ class Metadata:
     mask_voxel_m: float
     mask_count: int
     mask_corner: tuple[int, int, int]
+    mask_shape: tuple[int, int, int]
 
     @classmethod
     def of(
-        cls, region: StoredRegion, precision: str, mask_corner: tuple[int, int, int]
+        cls,
+        region: StoredRegion,
+        precision: str,
+        mask_corner: tuple[int, int, int],
+        mask_shape: tuple[int, int, int],
     ) -> Metadata:
         """The metadata of a region about to be encoded."""
         return cls(
@@ -54,6 +59,7 @@ class Metadata:
             mask_voxel_m=region.mask.voxel_m,
             mask_count=region.mask.flags.shape[0],
             mask_corner=mask_corner,
+            mask_shape=mask_shape,
         )
 
     def to_json(self) -> str:
@@ -72,6 +78,7 @@ class Metadata:
                     "voxel_m": self.mask_voxel_m,
                     "count": self.mask_count,
                     "corner": self.mask_corner,
+                    "shape": self.mask_shape,
                 },
             },
             separators=(",", ":"),
@@ -104,6 +111,7 @@ class Metadata:
                 mask_voxel_m=_real(mask["voxel_m"]),
                 mask_count=_whole(mask["count"]),
                 mask_corner=_triple(mask["corner"]),
+                mask_shape=_triple(mask["shape"]),
             )
         except KeyError as error:
             raise MapError(f"{name}: the metadata lacks {error}; it is damaged") from error
@@ -134,6 +142,7 @@ class Metadata:
             ("mask.voxel_m", 1e-3 <= self.mask_voxel_m <= 100.0),
             ("mask.count", 2 <= self.mask_count <= MAX_MASK_COUNT and self.mask_count % 2 == 0),
             ("mask.corner", all(0 <= value <= self.mask_count for value in self.mask_corner)),
+            ("mask.shape", all(0 <= value <= self.mask_count for value in self.mask_shape)),
         )
         for what, holds in checks:
             if not holds:

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from meslam_core.simulation import furnishing, textures
+from meslam_core.simulation import building_rooms, textures
+from meslam_core.simulation.furniture import OAK
 from meslam_core.simulation.path import Route, looking_ahead
 from meslam_core.simulation.scene import Lamp, Patch, Scene
 from meslam_core.simulation.walls import Chamber, Opening
@@ -65,7 +66,7 @@ def building() -> Scene:
     for number in range(8):
         room, openings = _room(number), _openings(number)
         patches += _shell(room, number, openings)
-        patches += furnishing.ROOMS[number](room)
+        patches += building_rooms.ROOMS[number](room)
         x, y = (room.west + room.east) / 2, (room.south + room.north) / 2
         lamps += [Lamp((x + dx, y, HEIGHT_M - 0.1), 0.5, 5.0, 6.0) for dx in (-1.3, 1.3)]
     patches = [replace(patch, texel_m=patch.texel_m * TEXEL_SCALE) for patch in patches]
@@ -104,7 +105,7 @@ def _openings(number: int) -> dict[str, list[Opening]]:
 
 def _shell(room: Chamber, number: int, openings: dict[str, list[Opening]]) -> list[Patch]:
     """Walls with doorways, floor and ceiling of a room; each doorway is built once."""
-    frame, sill = textures.wood((0.86, 0.80, 0.70), contrast=0.12), textures.wood(furnishing.OAK)
+    frame, sill = textures.wood((0.86, 0.80, 0.70), contrast=0.12), textures.wood(OAK)
     patches = []
     for turn, (side, holes) in enumerate(openings.items()):
         paper = PAPERS[(3 * number + turn) % len(PAPERS)]
@@ -128,5 +129,5 @@ def _corridor() -> tuple[list[Patch], list[Lamp]]:
         patches.append(CORRIDOR.wall(side).face(paper, 0.003, openings))
     ceiling = textures.checker((0.86, 0.86, 0.84), (0.76, 0.76, 0.75), 0.6)
     patches += CORRIDOR.floor_and_ceiling(textures.checker((0.62, 0.56, 0.48), (0.44, 0.40, 0.38), 0.4), ceiling)
-    patches += furnishing.corridor(CORRIDOR)
+    patches += building_rooms.corridor(CORRIDOR)
     return patches, [Lamp((x, 1.1, HEIGHT_M - 0.1), 0.4, 4.0, 6.0) for x in np.arange(2.2, 26.0, 4.3)]

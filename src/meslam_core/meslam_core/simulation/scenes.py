@@ -6,10 +6,17 @@ from collections.abc import Callable
 
 from meslam_core.errors import ConfigError
 from meslam_core.simulation.building import building
+from meslam_core.simulation.corridor import corridor
+from meslam_core.simulation.library import library
 from meslam_core.simulation.room import room
 from meslam_core.simulation.scene import Scene
 
-SCENES: dict[str, Callable[[], Scene]] = {"building": building, "room": room}
+SCENES: dict[str, Callable[[], Scene]] = {
+    "building": building,
+    "corridor": corridor,
+    "library": library,
+    "room": room,
+}
 
 
 def build_scene(name: str) -> Scene:

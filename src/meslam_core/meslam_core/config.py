@@ -140,7 +140,7 @@ class FieldConfig:
         9.0,
         "standard deviation of the embedding's frequencies, region coordinates",
         minimum=0.5,
-        maximum=50.0,
+        maximum=1000.0,
     )
     density_scale: float = setting(
         500.0,
@@ -317,7 +317,7 @@ class RegionsConfig:
     """Distribution of networks in space (Sec. II-C)."""
 
     volume_m3: float = setting(
-        30.0, "volume of a region's box (a cube)", unit="m^3", minimum=0.1, maximum=10000.0
+        30.0, "volume of a region's box (a cube)", unit="m^3", minimum=0.1, maximum=1e6
     )
     overlap: float = setting(
         0.2,
@@ -473,4 +473,17 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "default": {},
     "fine": {"field": {"width": 128}},
     "paper": {"field": {"width": 256}, "odometry": {"method": "colored_icp"}},
+    # The paper's baseline: one network for a cube of 48 m, with nearly the default's frequencies
+    # a metre; no odometry, and nothing registered.
+    "imap_star": {
+        "odometry": {"method": "none"},
+        "field": {"width": 256, "embedding_sigma": 100.0},
+        "keyframes": {"links": 0},
+        "regions": {
+            "volume_m3": 110592.0,
+            "overlap": 0.01,
+            "mask_voxel_m": 0.16,
+            "mask_extent": 1.0,
+        },
+    },
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +11,10 @@ from data.textured_room import frame_at, path
 
 from meslam_core.config import MeslamConfig
 from meslam_core.mapping.keyframes import KeyframeStore, rays_at
-from meslam_core.regions.atlas import RegionAtlas
+from meslam_core.regions.atlas import NEAR_M, RegionAtlas
 from meslam_core.regions.region import Region
+from meslam_core.scratch import ScratchFile
+from meslam_core.se3 import exp
 
 CONFIG = MeslamConfig.from_overrides(
     ["field.backend=torch", "keyframes.rays=512", "regions.mask_voxel_m=0.1"]
@@ -143,3 +147,167 @@ def test_region_coordinates_span_the_box(atlas):
     )
     expected = torch.tensor([[1.0, -1.0, 1.0], [0.0, 0.0, 0.0]])
     torch.testing.assert_close(region.to_region(corners), expected, atol=1e-5, rtol=0)
+
+
+def far(atlas: RegionAtlas, position: np.ndarray) -> None:
+    """Move and do what an update leaves to be done."""
+    atlas.update(position)
+    atlas.settle()
+
+
+@pytest.fixture
+def resting(atlas: RegionAtlas) -> RegionAtlas:
+    """The same atlas with a disk to rest on."""
+    scratch = ScratchFile()
+    keyframes = KeyframeStore(512, torch.device("cpu"), scratch=scratch)
+    atlas = RegionAtlas(CONFIG, np.zeros(3), keyframes, seed=0, scratch=scratch)
+    add_keyframe(atlas, path(1)[0])
+    return atlas
+
+
+def asleep(atlas: RegionAtlas) -> list[tuple[int, int, int]]:
+    return [index for index, region in atlas.regions.items() if region.at_rest]
+
+
+def test_what_is_left_rests_on_disk_and_wakes_before_it_is_entered(resting):
+    far(resting, at(0.45))
+    assert asleep(resting) == []
+    far(resting, at(1.0))
+    weights = resting.regions[(0, 0, 0)].weights()
+    assert asleep(resting) == [(0, 0, 0)]
+    border = (0.5 * resting.grid.side_m + NEAR_M) / resting.grid.spacing_m
+    far(resting, at(border + 0.02))
+    assert asleep(resting) == [(0, 0, 0)]
+    far(resting, at(border - 0.02))
+    assert asleep(resting) == []
+    assert resting.training == []
+    np.testing.assert_array_equal(resting.regions[(0, 0, 0)].weights(), weights)
+
+
+def test_a_camera_that_sways_at_a_border_wakes_and_rests_nothing(resting):
+    far(resting, at(0.45))
+    far(resting, at(0.9))
+    inside, outside = at(0.615), at(0.64)
+    far(resting, inside)
+    field = resting.regions[(0, 0, 0)].field
+    for _ in range(5):
+        far(resting, outside)
+        far(resting, inside)
+    assert resting.regions[(0, 0, 0)].field is field
+
+
+def test_regions_in_memory_do_not_grow_with_those_that_exist(resting):
+    for step in np.arange(0.0, 12.0, 0.25):
+        far(resting, at(step))
+        assert len(resting.regions) - len(asleep(resting)) <= 2
+    assert len(resting.regions) == 13
+
+
+def test_rays_of_regions_at_rest_leave_memory_and_are_there_again_on_return(resting):
+    far(resting, at(0.45))
+    later = path(2)[1]
+    later[:3, 3] = at(3.0)
+    far(resting, at(3.0))
+    new = add_keyframe(resting, later)
+    far(resting, at(6.0))
+    assert resting.keyframes.drawable([0, new]).tolist() == [new]
+    far(resting, at(0.0))
+    assert resting.keyframes.drawable(resting.working.keyframes).tolist() == [0]
+
+
+def test_at_a_corner_eight_regions_are_active_and_the_nearest_works(resting):
+    far(resting, at(0.47, 0.47, 0.47))
+    assert len(resting.regions) == len(resting.active) == 8
+    assert resting.working.index == (0, 0, 0)
+    far(resting, at(0.56, 0.44, 0.56))
+    assert resting.working.index == (1, 0, 1)
+    assert len(resting.active) == 8
+    # Back over one of the middles alone.
+    far(resting, at(0.56, 0.44, 0.44))
+    assert resting.working.index == (1, 0, 0)
+
+
+def test_a_camera_on_the_middle_does_not_make_the_working_region_flip(resting):
+    changes = 0
+    sway = 0.8 * CONFIG.regions.hysteresis_m / resting.grid.spacing_m
+    for number in range(20):
+        change = resting.update(at(0.5 + sway * (-1) ** number, 0.5 - sway * (-1) ** number))
+        changes += change.working_changed
+    assert changes == 0
+
+
+def with_regions(atlas: RegionAtlas, **changed: object) -> RegionAtlas:
+    config = replace(CONFIG, regions=replace(CONFIG.regions, **changed))
+    return RegionAtlas(config, np.zeros(3), atlas.keyframes, seed=0)
+
+
+def test_a_new_region_can_begin_with_copied_weights_or_from_nothing(atlas):
+    points = np.random.default_rng(0).uniform(-1.0, 2.5, (300, 3))
+    parents, children = {}, {}
+    for how in ("continued", "copied", "random"):
+        other = with_regions(atlas, initialisation=how)
+        other.working.keyframes = [0]
+        other.working.field.load_flat(other.working.weights() * 0.9)
+        other.update(at(0.45))
+        parents[how], children[how] = other.regions[(0, 0, 0)], other.regions[(1, 0, 0)]
+    np.testing.assert_array_equal(children["copied"].weights(), parents["copied"].weights())
+    for how in ("copied", "random"):
+        apart = predicted(children[how], points) - predicted(parents[how], points)
+        assert np.abs(apart).max() > 0.05
+    np.testing.assert_allclose(
+        predicted(children["continued"], points), predicted(parents["continued"], points), atol=2e-4
+    )
+
+
+def test_a_new_region_goes_on_with_what_was_observed(atlas):
+    atlas.update(at(0.45))
+    parent, child = atlas.regions[(0, 0, 0)], atlas.regions[(1, 0, 0)]
+    points = np.random.default_rng(0).uniform(-1.0, 2.5, (2000, 3))
+    before = parent.mask.lookup(points - parent.T_map_region[:3, 3])
+    after = child.mask.lookup(points - child.T_map_region[:3, 3])
+    # Voxels do not lie in the same places: only their borders may differ.
+    assert np.mean(before != after) < 0.1
+    assert np.count_nonzero(after) > 50
+
+
+def test_one_network_can_serve_everywhere(atlas):
+    single = with_regions(atlas, single=True)
+    for step in range(8):
+        assert single.update(at(step, -step)).created == ()
+    assert list(single.regions) == [(0, 0, 0)]
+
+
+def test_a_keyframe_that_saw_a_region_at_rest_is_replayed_when_it_wakes(resting):
+    far(resting, at(0.45))
+    far(resting, at(1.2))
+    back = path(1)[0]
+    back[:3, :3] = back[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    back[:3, 3] = at(1.2)
+    number = add_keyframe(resting, back)
+    assert number not in resting.regions[(0, 0, 0)].keyframes
+    seen_before = resting.regions[(0, 0, 0)].observed().observed_volume_m3
+    far(resting, at(0.55))
+    assert number in resting.regions[(0, 0, 0)].keyframes
+    assert resting.regions[(0, 0, 0)].mask.observed_volume_m3 > seen_before
+
+
+def test_a_region_that_was_moved_has_its_neighbours_beside_it(atlas):
+    motion = exp(np.array([0.3, -0.1, 0.05, 0.02, -0.05, 0.3]))
+    atlas.working.T_map_region = motion @ atlas.working.T_map_region
+
+    def moved(point: np.ndarray) -> np.ndarray:
+        return motion[:3, :3] @ point + motion[:3, 3]
+
+    atlas.update(moved(at(0.36)))
+    assert list(atlas.regions) == [(0, 0, 0)]
+    atlas.update(moved(at(0.45)))
+    assert list(atlas.regions) == [(0, 0, 0), (1, 0, 0)]
+    child = atlas.regions[(1, 0, 0)]
+    np.testing.assert_allclose(child.T_map_region[:3, 3], moved(at(1.0)), atol=1e-9)
+    np.testing.assert_allclose(child.T_map_region[:3, :3], motion[:3, :3])
+    points = np.random.default_rng(0).uniform(-1.0, 2.0, (200, 3))
+    np.testing.assert_allclose(
+        predicted(child, points), predicted(atlas.working, points), atol=3e-4
+    )
+    atlas.update(moved(at(0.6)))
+    assert atlas.working is child

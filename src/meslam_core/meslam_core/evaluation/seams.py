@@ -133,7 +133,8 @@ def _places(neural_map: NeuralMap, first: PlacedRegion, second: PlacedRegion) ->
         step = (neural_map.surface_level - values.distance) / np.maximum(slope, 1e-6)
         good = np.isfinite(step) & (np.abs(step) * np.sqrt(slope) < REACH_M)
         points = points[good] + step[good, None] * within[good]
-        normals = gradient[good] / np.linalg.norm(gradient[good], axis=1)[:, None]
+        length = np.maximum(np.linalg.norm(gradient[good], axis=1), 1e-6)
+        normals = gradient[good] / length[:, None]
     across = axis - (normals @ axis)[:, None] * normals
     length = np.linalg.norm(across, axis=1)
     inside = _inside(first, points) & _inside(second, points)
@@ -145,10 +146,8 @@ def _places(neural_map: NeuralMap, first: PlacedRegion, second: PlacedRegion) ->
 
 
 def _inside(region: PlacedRegion, points: Floats) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = (np.abs(region.to_local(points)) < region.stored.half_side_m).all(
-        axis=1
-    )
-    return inside
+    local = np.abs(region.to_local(points))
+    return np.asarray((local < region.stored.half_side_m).all(axis=1), bool)
 
 
 def _nearest_alone(
@@ -182,7 +181,7 @@ def _jumps(
 
 def _crossings(values: NDArray[np.float32]) -> NDArray[np.float64]:
     """Height of the crossing nearest to 0 along the last axis [m]; NaN where there is none."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):
         crossing = (values[..., :-1] < 0) != (values[..., 1:] < 0)
         crossing &= np.isfinite(values[..., :-1]) & np.isfinite(values[..., 1:])
         share = values[..., :-1] / (values[..., :-1] - values[..., 1:])

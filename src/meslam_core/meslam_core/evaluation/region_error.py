@@ -1,0 +1,96 @@
+"""How far one region's map, asked alone, is from the true surface in its box, and over visits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meslam_core.field.rendering import surface_level
+from meslam_core.map.placed_region import PlacedRegion
+from meslam_core.regions.grid import RegionIndex
+from meslam_core.regions.observed_mask import OBSERVED
+
+
+@dataclass(frozen=True)
+class RegionError:
+    """Distance of the true surface in a region's box to the region's own surface.
+
+    Attributes:
+        points: of the true surface in the box that the region has observed.
+        median_m, mean_m: of their distances, each at most the truncation [m]; NaN without points.
+    """
+
+    points: int
+    median_m: float
+    mean_m: float
+
+    def to_dict(self) -> dict[str, float]:
+        """Plain numbers for a report."""
+        return asdict(self)
+
+
+def region_error(region: PlacedRegion, surface: NDArray[np.floating]) -> RegionError:
+    """A region's error, whatever other regions say of the same place.
+
+    Args:
+        region: ready to answer.
+        surface: (N, 3) points of the true surface, map frame [m].
+    """
+    local = region.to_local(surface)
+    local = local[(np.abs(local) < region.stored.half_side_m).all(axis=1)]
+    local = local[region.lookup(local) & OBSERVED > 0]
+    if not len(local):
+        return RegionError(0, float("nan"), float("nan"))
+    architecture = region.stored.architecture
+    values, gradient = region.gradient(local)
+    slope = np.maximum(np.linalg.norm(gradient, axis=1), 1.0 / architecture.truncation_m / 8.0)
+    off = np.abs(values[:, 0] - surface_level(architecture.field_config())) / slope
+    off = np.minimum(off, architecture.truncation_m)
+    return RegionError(len(local), float(np.median(off)), float(off.mean()))
+
+
+@dataclass
+class Visit:
+    """From when a region begins to work until another one takes over.
+
+    Attributes:
+        region: its place on the lattice.
+        others: different regions that worked since it was left last; -1 at the first visit.
+        error_at_return, error_when_left: of its map; None where not measured.
+    """
+
+    region: RegionIndex
+    others: int = -1
+    error_at_return: RegionError | None = None
+    error_when_left: RegionError | None = None
+
+
+@dataclass
+class RegionVisits:
+    """Follows which region works, and measures its map whenever that changes.
+
+    Args:
+        error: of the map of a region as it is at the moment.
+
+    Attributes:
+        visits: so far; the last one goes on.
+    """
+
+    error: Callable[[RegionIndex], RegionError]
+    visits: list[Visit] = field(default_factory=list)
+
+    def follow(self, working: RegionIndex) -> None:
+        """Call after every frame, while nothing trains, with the region that works."""
+        if self.visits and self.visits[-1].region == working:
+            return
+        if self.visits:
+            self.visits[-1].error_when_left = self.error(self.visits[-1].region)
+        before = [n for n, visit in enumerate(self.visits) if visit.region == working]
+        visit = Visit(working)
+        if before:
+            visit.others = len({each.region for each in self.visits[before[-1] + 1 :]})
+            visit.error_at_return = self.error(working)
+        self.visits.append(visit)

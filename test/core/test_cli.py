@@ -24,7 +24,7 @@ from meslam_core.recordings import open_recording
 from meslam_core.se3 import exp
 from meslam_core.trajectory import Trajectory, write_tum
 
-COMMANDS = ["run", "evaluate", "mesh", "query", "info", "convert", "simulate"]
+COMMANDS = ["run", "evaluate", "mesh", "query", "merge", "info", "convert", "simulate"]
 QUICK = [
     "--set", "mapping.first_iterations=40", "--set", "mapping.iterations=2",
     "--set", "mapping.final_iterations=5", "--set", "keyframes.rays=512",

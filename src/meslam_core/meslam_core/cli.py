@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from meslam_core import __version__
+from meslam_core import __version__, cli_map
 from meslam_core.command_output import (
     BAD_INPUT,
     complain,
     exit_after_run,
-    exit_if_damaged,
     print_entries,
     run_summary,
 )
@@ -29,7 +28,6 @@ from meslam_core.errors import ConfigError, MeslamError
 # Torch and Open3D take seconds to import, so every command imports what it needs itself.
 if TYPE_CHECKING:
     from meslam_core.camera import PinholeCamera
-    from meslam_core.map.neural_map import NeuralMap
 
 NEXT_STEPS = """\
 MeSLAM maps a room with an RGB-D camera and keeps the map in small neural networks.
@@ -101,7 +99,6 @@ LeverArmOption = Annotated[
         help="The true poses are another sensor's on the same mount: find its place as well.",
     ),
 ]
-MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map store.")]
 
 
 @app.command()
@@ -110,7 +107,7 @@ def run(
     out: Annotated[Path, typer.Option(help="Folder for the results; made if missing.")],
     camera: CameraOption = None,
     preset: Annotated[
-        str, typer.Option(help="Settings to start from: default, fine or paper.")
+        str, typer.Option(help="Settings to start from: default, fine, paper or imap_star.")
     ] = "default",
     overrides: SetOption = None,
     frames: Annotated[
@@ -193,60 +190,20 @@ def evaluate(
     print_entries(entries, as_json)
 
 
-@app.command()
-def mesh(
-    stored: MapArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE.ply", help="The mesh file.")],
-    resolution: Annotated[float, typer.Option(help="Spacing of the vertices [m].")] = 0.02,
-) -> None:
-    """Extract a map's coloured surface as a triangle mesh."""
-    from meslam_core.console import counting_bar, error_console
-    from meslam_core.map.mesh import extract_mesh
-    from meslam_core.map.mesh_file import write_mesh
-
-    neural_map, damaged = _load_map(stored)
-    with counting_bar(error_console(), "tiles") as progress:
-        surface = extract_mesh(neural_map, resolution, progress=progress)
-    write_mesh(surface, out)
-    typer.echo(f"{out}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles")
-    exit_if_damaged(stored, damaged)
-
-
-@app.command()
-def query(
-    stored: MapArgument,
-    points: Annotated[Path, typer.Option(metavar="FILE.npy", help="(N, 3) floats, map frame [m].")],
-    out: Annotated[Path, typer.Option(metavar="FILE.npy", help="The answers, one a point.")],
-) -> None:
-    """Ask a map about points.
-
-    Writes a structured array (N,) with the fields occupancy (int8: -1 unknown, 0 free, 100
-    occupied), probability (float32, of being occupied; 0.5 where unknown), density (float32,
-    1/m; NaN where unknown), distance (float32, m: to the nearest surface, positive behind it; NaN
-    where unknown) and color (3 uint8, RGB; meaningful near surfaces, 0 where unknown).
-    """
-    from meslam_core.point_query import answer, read_points, write_answers
-
-    wanted = read_points(points)
-    neural_map, damaged = _load_map(stored)
-    write_answers(out, answer(neural_map, wanted))
-    typer.echo(f"{out}: {len(wanted)} answers")
-    exit_if_damaged(stored, damaged)
+app.add_typer(cli_map.app)
 
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(metavar="RECORDING_OR_MAP")],
+    paths: Annotated[list[Path], typer.Argument(metavar="RECORDING_OR_MAP...")],
     camera: CameraOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Tell what a recording or a map holds."""
-    if path.is_dir() and ((path / "manifest.json").exists() or path.suffix == ".meslam"):
-        from meslam_core.map_info import describe_map
-
-        facts, damaged = describe_map(path)
-        print_entries(facts, as_json)
-        exit_if_damaged(path, damaged)
+    """Tell what a recording or a map holds; several maps in one frame are taken as one."""
+    path = paths[0]
+    stored = path.is_dir() and ((path / "manifest.json").exists() or path.suffix == ".meslam")
+    if stored or len(paths) > 1:
+        cli_map.describe(paths, as_json)
         return
     from meslam_core.recordings import describe, open_recording
 
@@ -318,15 +275,6 @@ def _camera(path: Path | None) -> PinholeCamera | None:
     from meslam_core.camera import PinholeCamera
 
     return None if path is None else PinholeCamera.from_json(path)
-
-
-def _load_map(path: Path) -> tuple[NeuralMap, list[str]]:
-    """A map and a sentence for every damage found."""
-    from meslam_core.map.neural_map import NeuralMap
-    from meslam_core.map.store import MapStore
-
-    loaded = MapStore(path).load()
-    return NeuralMap(loaded.regions), loaded.warnings
 
 
 def _show_warnings() -> None:

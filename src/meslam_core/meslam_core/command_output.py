@@ -86,7 +86,7 @@ def exit_after_run(outcome: RunOutcome, out: Path) -> None:
         raise typer.Exit(status)
 
 
-def exit_if_damaged(path: Path, damages: list[str]) -> None:
+def exit_if_damaged(path: Path | str, damages: list[str]) -> None:
     """State the damage of a map whose intact part was used."""
     if damages:
         for damage in damages:

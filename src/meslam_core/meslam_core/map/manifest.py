@@ -20,6 +20,7 @@ MAP_FORMAT = "meslam-map"
 MAP_VERSION = 1
 MAX_MANIFEST_BYTES = 16 << 20
 MAX_REGIONS = 100_000
+OFF_LATTICE = 1 << 20  # added to the third index of regions that lie on another lattice
 
 _DIGEST = re.compile(rb'"sha256": "([0-9a-f]{64})"\n\}\n\Z')
 _BLANK = b"0" * 64
@@ -138,9 +139,10 @@ def grid_of(regions: list[StoredRegion]) -> RegionGrid:
     Args:
         regions: at least one, none moved off the lattice.
     """
-    first = regions[0]
+    placed = [region for region in regions if abs(region.index[2]) < OFF_LATTICE // 2]
+    first = (placed or regions)[0]
     spacing_m = first.side_m * (1.0 - RegionsConfig().overlap)
-    for other in regions[1:]:
+    for other in placed[1:]:
         steps = np.subtract(other.index, first.index)
         axis = int(np.abs(steps).argmax())
         if steps[axis]:

@@ -34,6 +34,7 @@ class LoadedMap:
         map_id: identifies the map.
         grid: the lattice of its regions.
         regions: those that are intact.
+        encoded: their bytes as they are stored, by index.
         nodes: of the pose graph.
         warnings: one sentence for every damage found; empty for an intact map.
     """
@@ -41,6 +42,7 @@ class LoadedMap:
     map_id: str
     grid: RegionGrid
     regions: list[StoredRegion]
+    encoded: dict[RegionIndex, bytes] = field(default_factory=dict)
     nodes: tuple[dict[str, Any], ...] = ()
     warnings: list[str] = field(default_factory=list)
 
@@ -92,46 +94,52 @@ def _load(path: Path, data: bytes) -> tuple[LoadedMap, bool]:
         raise
     except MapError as error:
         return _rebuilt(path, str(error)), False
-    loaded = LoadedMap(manifest.map_id, manifest.grid, [], manifest.nodes)
+    loaded = LoadedMap(manifest.map_id, manifest.grid, [], nodes=manifest.nodes)
     vanished = False
     for entry in manifest.regions:
         try:
-            loaded.regions.append(_read_region(path / entry.file, entry))
+            region, data = _read_region(path / entry.file, entry)
         except FileNotFoundError:
             vanished = True
             loaded.warnings.append(f"{path / entry.file} is missing; region left out")
         except (MapError, OSError) as error:
             loaded.warnings.append(f"region {entry.index} left out: {error}")
+        else:
+            loaded.regions.append(region)
+            loaded.encoded[region.index] = data
     return loaded, vanished
 
 
-def _read_region(path: Path, entry: RegionEntry) -> StoredRegion:
+def _read_region(path: Path, entry: RegionEntry) -> tuple[StoredRegion, bytes]:
     data = _read_limited(path)
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise MapError(f"{path}: the checksum does not match the manifest; it is damaged")
     region = codec.decode(data, str(path))
     if region.index != entry.index:
         raise MapError(f"{path} holds region {region.index} instead of {entry.index}")
-    return region
+    return region, data
 
 
 def _rebuilt(path: Path, reason: str) -> LoadedMap:
     """The map as far as its region files tell it: the newest intact one of each place."""
     newest: dict[RegionIndex, StoredRegion] = {}
+    encoded: dict[RegionIndex, bytes] = {}
     warnings = [f"{reason}; the map is put together from its region files"]
     for name in sorted(filter(is_region_file, os.listdir(path))):
         try:
-            region = codec.decode(_read_limited(path / name), str(path / name))
+            data = _read_limited(path / name)
+            region = codec.decode(data, str(path / name))
         except (MapError, OSError) as error:
             warnings.append(f"left out: {error}")
             continue
         other = newest.get(region.index)
         if other is None or (region.stamp_ns, region.version) > (other.stamp_ns, other.version):
             newest[region.index] = region
+            encoded[region.index] = data
     if not newest:
         raise MapError(f"{reason}; there is no intact region file to rebuild the map from")
     regions = [newest[index] for index in sorted(newest)]
-    return LoadedMap(uuid.uuid4().hex, grid_of(regions), regions, (), warnings)
+    return LoadedMap(uuid.uuid4().hex, grid_of(regions), regions, encoded, warnings=warnings)
 
 
 def _read_limited(path: Path) -> bytes:

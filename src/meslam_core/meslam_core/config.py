@@ -348,6 +348,11 @@ class RegionsConfig:
         choices=("continued", "copied", "random"),
     )
     single: bool = setting(False, "one network for everything: no region is made but the first")
+    close_loops: bool = setting(
+        True,
+        "a region that is come back to is recognised, and the path since is corrected by what that "
+        "says; else it is trained wherever the camera is believed to be",
+    )
 
 
 @dataclass(frozen=True)
@@ -480,8 +485,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "field": {"width": 256, "embedding_sigma": 100.0},
         "keyframes": {"links": 0},
         "regions": {
+            "single": True,
             "volume_m3": 110592.0,
-            "overlap": 0.01,
             "mask_voxel_m": 0.16,
             "mask_extent": 1.0,
         },

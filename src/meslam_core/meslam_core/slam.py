@@ -14,6 +14,7 @@ from meslam_core.config import MeslamConfig
 from meslam_core.field import field_device, make_field
 from meslam_core.frame import RgbdFrame
 from meslam_core.frame_result import FrameResult, TrackingState
+from meslam_core.loop.recognition import RegionRecogniser
 from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.joint_optimizer import JointOptimizer
 from meslam_core.mapping.keyframe_policy import KeyframePolicy
@@ -121,6 +122,7 @@ class Slam:
         self._linker: CovisibilityLinker | None = None
         if config.keyframes.links:
             self._linker = CovisibilityLinker(self.keyframes, config, self._scratch)
+        self.recogniser: RegionRecogniser | None = None
         self._trained: list[Region] = []
         self._latest_training = Training()
         self._steps_owed = 0
@@ -356,7 +358,7 @@ class Slam:
         So a frame costs the same at a corner, where eight regions meet, as between two.
         """
         assert self.atlas is not None
-        others = self.atlas.training
+        others = [region for region in self.atlas.training if region.confirmed]
         self._turn += 1
         return [self.atlas.working, *(others[self._turn % len(others)] for _ in others[:1])]
 
@@ -375,6 +377,12 @@ class Slam:
         if linked is not None and self._linker is not None:
             for link in self._linker.link(*linked):
                 self.keyframes.add_link(link.first, link.second, link.T_first_second)
+            if self.recogniser is not None:
+                corrections = self.recogniser.corrections
+                for region in self.atlas.doubtful:
+                    self.recogniser.ask(region, *linked)
+                if self.recogniser.corrections > corrections:
+                    pose = self.keyframes.pose(linked[0])
         least = self.config.mapping.min_iterations
         losses = self.optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
@@ -399,6 +407,8 @@ class Slam:
         self.atlas = RegionAtlas(
             self.config, pose[:3, 3], self.keyframes, self._seed, self._scratch
         )
+        if self._linker is not None and self.config.regions.close_loops:
+            self.recogniser = RegionRecogniser(self.atlas, self._linker)
         self._add_keyframe(frame, pending.pixels, pose, pending.result.odometry)
         self._trained = [self.atlas.working]
         self._steps_owed = self.config.mapping.first_iterations

@@ -287,6 +287,10 @@ def test_a_keyframe_that_saw_a_region_at_rest_is_replayed_when_it_wakes(resting)
     assert number not in resting.regions[(0, 0, 0)].keyframes
     seen_before = resting.regions[(0, 0, 0)].observed().observed_volume_m3
     far(resting, at(0.55))
+    # Not before it is known where the camera is in its map.
+    assert number not in resting.regions[(0, 0, 0)].keyframes
+    resting.regions[(0, 0, 0)].confirmed = True
+    far(resting, at(0.55))
     assert number in resting.regions[(0, 0, 0)].keyframes
     assert resting.regions[(0, 0, 0)].mask.observed_volume_m3 > seen_before
 

@@ -6,11 +6,13 @@ again what an older one saw is registered with it directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.config import MeslamConfig
@@ -30,6 +32,14 @@ MIN_AGREEMENT = 0.3
 # A registration farther from where the keyframes are believed to be is not believed itself.
 MAX_CORRECTION_M = 0.15
 MAX_CORRECTION_RAD = 0.12
+# A place is recognised when so many older keyframes say the same of where the camera is; these
+# share at least this much of the view, as far as the believed pose tells.
+RECOGNISING = 2
+RECOGNITION_ATTEMPTS = 4
+MIN_RECOGNISED_OVERLAP = 0.3
+# Recognised poses that agree within this are the same [m, rad].
+SAME_PLACE_M = 0.05
+SAME_PLACE_RAD = 0.02
 
 
 @dataclass(frozen=True)
@@ -84,6 +94,58 @@ class CovisibilityLinker:
         self._images.add(keyframe, image)
         return links
 
+    def recognise(
+        self, keyframe: int, frame: RgbdFrame, rays: Rays, among: Sequence[int]
+    ) -> list[CovisibilityLink]:
+        """Where a new keyframe is among older ones, however far off its pose is believed to be.
+
+        Args:
+            keyframe: number of the new one.
+            frame: its images.
+            rays: its sample, camera frame.
+            among: older keyframes.
+
+        Returns:
+            Links that agree with each other; none where the place is not recognised for certain.
+        """
+        overlaps = self._overlaps(keyframe, frame.camera, rays, np.array(among, np.int64))
+        prepared = self._registrar.prepare(KeyframeImage.of(frame, self._width).frame())
+        links: list[CovisibilityLink] = []
+        shared = [k for k, overlap in overlaps if overlap > MIN_RECOGNISED_OVERLAP]
+        for other in shared[:RECOGNITION_ATTEMPTS]:
+            T_other_keyframe = self._search(other, keyframe, prepared)
+            if T_other_keyframe is None:
+                continue
+            link = CovisibilityLink(other, keyframe, T_other_keyframe)
+            alike = [each for each in links if self._agree(each, link)]
+            if len(alike) + 1 >= RECOGNISING:
+                return [*alike, link]
+            links.append(link)
+        return []
+
+    def _search(self, older: int, keyframe: int, prepared: Any) -> Pose | None:
+        """T_older_new (4, 4) where any start leads to a good fit; None where none does."""
+        guess = inverse(self._keyframes.pose(older)) @ self._keyframes.pose(keyframe)
+        target = self._registrar.prepare(self._images.get(older).frame())
+        best = None
+        try:
+            for start in (*self._registrar.propose(prepared, target), guess):
+                found = self._registrar.register(prepared, target, start)
+                if best is None or found.agreement > best.agreement:
+                    best = found
+        except RuntimeError:
+            return None
+        if best is None or best.fitness < MIN_FITNESS or best.agreement < MIN_AGREEMENT:
+            return None
+        return best.T_target_source
+
+    def _agree(self, first: CovisibilityLink, second: CovisibilityLink) -> bool:
+        """Whether two links say the same of where the new keyframe is."""
+        poses = [self._keyframes.pose(k.first) @ k.T_first_second for k in (first, second)]
+        apart = inverse(poses[0]) @ poses[1]
+        near = float(np.linalg.norm(apart[:3, 3])) < SAME_PLACE_M
+        return near and rotation_angle(apart) < SAME_PLACE_RAD
+
     def _register_all(
         self, keyframe: int, image: KeyframeImage, others: Iterable[int]
     ) -> list[CovisibilityLink]:
@@ -114,28 +176,34 @@ class CovisibilityLinker:
 
     def _candidates(self, keyframe: int, camera: PinholeCamera, rays: Rays) -> Iterator[int]:
         """Keyframes that share the view: those that share most and the oldest in turn."""
+        overlaps = self._overlaps(keyframe, camera, rays, self._images.numbers)
+        best = [number for number, overlap in overlaps if overlap > MIN_OVERLAP]
+        given: set[int] = set()
+        for two in zip(best, sorted(best), strict=True):
+            for number in two:
+                if number not in given:
+                    given.add(number)
+                    yield number
+
+    def _overlaps(
+        self, keyframe: int, camera: PinholeCamera, rays: Rays, others: NDArray[np.int64]
+    ) -> list[tuple[int, float]]:
+        """Older keyframes with the share of the new one's points that they see, most first."""
         pose = self._keyframes.pose(keyframe)
         step = max(1, len(rays) // JUDGED_POINTS)
         points = (rays.directions[::step] * rays.distances_m[::step, None]).numpy()
         points = points @ pose[:3, :3].T + pose[:3, 3]
-        numbers = self._images.numbers
         rotations, translations = self._keyframes.pose_arrays()
         # Two cameras farther apart measure no point in common.
-        apart = np.linalg.norm(translations[numbers] - pose[:3, 3].astype(np.float32), axis=1)
-        numbers = numbers[apart < 2.0 * self._reach_m]
-        if not len(numbers):
-            return
-        moved = points[None] - translations[numbers, None]
-        moved = np.einsum("kji,knj->kni", rotations[numbers], moved)
+        apart = np.linalg.norm(translations[others] - pose[:3, 3].astype(np.float32), axis=1)
+        others = others[(apart < 2.0 * self._reach_m) & (others != keyframe)]
+        if not len(others):
+            return []
+        moved = points[None] - translations[others, None]
+        moved = np.einsum("kji,knj->kni", rotations[others], moved)
         u, v, z = camera.project(moved.reshape(-1, 3))
         inside = (z > 0) & (z < self._reach_m)
         inside &= (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        overlap = inside.reshape(len(numbers), -1).mean(axis=1)
-        seen = numbers[overlap > MIN_OVERLAP]
-        best = numbers[np.argsort(-overlap, kind="stable")][: len(seen)]
-        given: set[int] = set()
-        for two in zip(best, np.sort(seen), strict=True):
-            for number in two:
-                if int(number) not in given:
-                    given.add(int(number))
-                    yield int(number)
+        overlap = inside.reshape(len(others), -1).mean(axis=1)
+        order = np.argsort(-overlap, kind="stable")
+        return [(int(others[row]), float(overlap[row])) for row in order]

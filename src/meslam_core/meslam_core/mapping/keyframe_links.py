@@ -42,6 +42,18 @@ class KeyframeLinks:
         self._weights[at] = weight
         self._count += 1
 
+    def all(self) -> LinkBlock:
+        """Every link, its ends the numbers of the keyframes."""
+        ends = self._ends[: self._count]
+        return LinkBlock(
+            int(ends.max(initial=-1)) + 1,
+            np.zeros(0, np.int64),
+            ends,
+            self._rotations[: self._count],
+            self._translations[: self._count],
+            self._weights[: self._count],
+        )
+
     def among(
         self, keyframes: NDArray[np.int64], limit: int, generator: np.random.Generator
     ) -> LinkBlock:

@@ -176,6 +176,12 @@ class KeyframeStore:
             self._rotations[index] = T_map_camera[:3, :3]
             self._translations[index] = T_map_camera[:3, 3]
 
+    def poses(self) -> NDArray[np.float64]:
+        """T_map_camera (K, 4, 4) of all keyframes."""
+        poses = np.tile(np.eye(4), (len(self), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = self.pose_arrays()
+        return poses
+
     def set_poses(
         self, keyframes: NDArray[np.int64], rotations: Floats, translations: Floats
     ) -> None:

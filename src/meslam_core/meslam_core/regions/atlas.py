@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from meslam_core.config import MeslamConfig
 from meslam_core.field import make_field
 from meslam_core.field.network import shifted
+from meslam_core.loop.pose_graph import rigid_motion
 from meslam_core.mapping.keyframes import KeyframeStore
 from meslam_core.regions.grid import RegionGrid, RegionIndex
 from meslam_core.regions.observed_mask import ObservedMask
 from meslam_core.regions.region import Region
 from meslam_core.scratch import ScratchFile
-from meslam_core.se3 import inverse
+from meslam_core.se3 import inverse, orthonormalized
 
 MIN_VISIBLE_SHARE = 0.1
 # Regions whose boxes are so near are awake, though not in training: entering costs nothing then,
@@ -64,11 +65,13 @@ class RegionAtlas:
         self.grid = RegionGrid.around(position, config.regions)
         self.keyframes = keyframes
         self._seed = seed
+        self._recognises = config.regions.close_loops and config.keyframes.links > 0
         self._scratch = scratch
         self.regions: dict[RegionIndex, Region] = {}
         self._working: RegionIndex = (0, 0, 0)
         self._training: list[RegionIndex] = []
         self._near: list[RegionIndex] = []
+        self._awake: list[Region] = []
         T_map_region = np.eye(4)
         T_map_region[:3, 3] = self.grid.center(self._working)
         self.regions[self._working] = self._new_region(self._working, T_map_region)
@@ -92,26 +95,62 @@ class RegionAtlas:
         """Create, wake and switch regions for a camera at `position` (3,), map frame [m]."""
         if self.config.regions.single:
             return RegionChange()
-        position = self._on_lattice(position)
-        containing = self.grid.containing(position)
+        on_lattice = self._on_lattice(position)
+        containing = self.grid.containing(on_lattice)
         created = [index for index in containing if index not in self.regions]
         before = set(self._training)
         for index in created:
             self.regions[index] = self._neighbour(index)
         changed = False
-        past = self.grid.distance_past_middle(position, self._working)
-        if past > self.config.regions.hysteresis_m:
-            nearest = self.grid.nearest(position)
+        if self.working.off_center_m(position) > 0.5 * self.grid.spacing_m:
+            nearest = self._nearest(position, on_lattice)
             if nearest not in self.regions:
                 self.regions[nearest] = self._neighbour(nearest)
                 created.append(nearest)
-            self._working, changed = nearest, True
-        self._training = [index for index in containing if index != self._working]
-        self._near = self.grid.containing(position, NEAR_M)
+            changed, self._working = nearest != self._working, nearest
+        inside = [i for i in self._about(on_lattice) if self._off_center(i, position) < self._half]
+        self._training = [index for index in inside if index != self._working]
+        reach = self._half + NEAR_M
+        self._near = [i for i in self._about(on_lattice) if self._off_center(i, position) < reach]
         for region in self.active:
-            region.wake()
+            self._wake(region)
+        self.working.confirmed = True
         woken = tuple(i for i in self._training if i not in before and i not in created)
         return RegionChange(tuple(created), woken, changed)
+
+    def _nearest(
+        self, position: NDArray[np.floating], on_lattice: NDArray[np.floating]
+    ) -> RegionIndex:
+        """The region that is to work for a camera past the middle of the working one's box.
+
+        The nearest one, if it is so by enough. One that the camera has not been recognised in has
+        to wait, as long as the working region contains the camera.
+        """
+        working = self.working.off_center_m(position)
+        leaving = working > self._half
+        found = [
+            (self._off_center(index, position), index)
+            for index in self._about(on_lattice)
+            if index != self._working and (leaving or self.regions[index].confirmed)
+        ]
+        distance, nearest = min(found, default=(np.inf, self._working))
+        if leaving and distance > self._half:
+            return self.grid.nearest(on_lattice)
+        if distance < working - 2.0 * self.config.regions.hysteresis_m:
+            return nearest
+        return self._working
+
+    def _about(self, on_lattice: NDArray[np.floating]) -> list[RegionIndex]:
+        """Existing regions whose boxes may be near a position on the lattice (3,) [m]."""
+        near = self.grid.containing(on_lattice, self.grid.spacing_m)
+        return [index for index in near if index in self.regions]
+
+    def _off_center(self, index: RegionIndex, position: NDArray[np.floating]) -> float:
+        return self.regions[index].off_center_m(position)
+
+    @property
+    def _half(self) -> float:
+        return 0.5 * self.grid.side_m
 
     def settle(self) -> None:
         """What an update leaves to be done beside tracking, a portion at a time.
@@ -123,11 +162,13 @@ class RegionAtlas:
         for index in self._near:
             region = self.regions.get(index)
             if region is not None and all(region is not each for each in kept):
-                region.wake()
+                self._wake(region)
                 kept.append(region)
         self._rest_except(kept)
+        self._awake = kept
         for region in kept:
-            self._meet(region)
+            if region.confirmed:
+                self._meet(region)
         wanted = [k for region in reversed(kept) for k in region.keyframes]
         self.keyframes.storage.hold(wanted, READ_A_FRAME)
         left = MARKED_A_FRAME
@@ -137,6 +178,22 @@ class RegionAtlas:
                 self.observe(region, keyframe)
             del region.unmarked[: len(portion)]
             left -= len(portion)
+
+    @property
+    def doubtful(self) -> list[Region]:
+        """Regions near the camera that woke and in which it has not been recognised since."""
+        return [region for region in self._awake if not region.confirmed]
+
+    def correct(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> None:
+        """Move every region with its keyframes; nothing is trained anew.
+
+        Args:
+            before, after: (K, 4, 4) T_map_camera of all keyframes.
+        """
+        for region in self.regions.values():
+            motion = rigid_motion(before[region.keyframes], after[region.keyframes])
+            region.T_map_region = orthonormalized(motion @ region.T_map_region)
+            region.version += 1
 
     @contextmanager
     def awake(self, region: Region) -> Iterator[Region]:
@@ -150,6 +207,8 @@ class RegionAtlas:
     def add_keyframe(self, keyframe: int) -> None:
         """Give a new keyframe to every active region and mark what it observed."""
         for region in self.active:
+            if not region.confirmed and region is not self.working:
+                continue
             region.keyframes.append(keyframe)
             self.observe(region, keyframe)
 
@@ -242,6 +301,10 @@ class RegionAtlas:
         points = self.keyframes.points(numbers) @ T[:3, :3].T + T[:3, 3]
         seen = (np.abs(points) < region.half_side_m).all(axis=2).mean(axis=1)
         return [int(k) for k in numbers[inside | (seen > MIN_VISIBLE_SHARE)]]
+
+    def _wake(self, region: Region) -> None:
+        region.wake()
+        region.confirmed = region.confirmed or not self._recognises
 
     def _rest_except(self, kept: list[Region]) -> None:
         if self._scratch is None:

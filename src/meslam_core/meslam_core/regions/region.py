@@ -48,6 +48,9 @@ class Region:
     Attributes:
         seen: keyframes below this number have been asked whether they see the region.
         unmarked: keyframes whose views the mask does not show yet.
+        confirmed: whether the camera is known to be where this region's map has it; after a rest
+            the path may have drifted.
+        doubts: keyframes since it woke that did not tell.
     """
 
     def __init__(
@@ -67,6 +70,8 @@ class Region:
         self.version = version
         self.seen = 0
         self.unmarked: list[int] = []
+        self.confirmed = True
+        self.doubts = 0
         self.field_config: FieldConfig = field.config
         self._field: FieldModel | None = field
         self._mask: ObservedMask | None = mask
@@ -101,6 +106,14 @@ class Region:
             return (points + T[:3, 3]) / self.half_side_m
         return (points @ T[:3, :3].T + T[:3, 3]) / self.half_side_m
 
+    def off_center_m(self, position: NDArray[np.floating]) -> float:
+        """Distance of a position (3,), map frame, to the centre along the farthest axis [m].
+
+        Inside the box it is less than half the side.
+        """
+        local = self.T_map_region[:3, :3].T @ (position - self.T_map_region[:3, 3])
+        return float(np.abs(local).max())
+
     def viewed(self, field: FieldModel, mask: ObservedMask) -> Region:
         """The same region with another network and mask, for who must not see them change."""
         return Region(
@@ -127,6 +140,7 @@ class Region:
         )
         self._rest = _Rest(scratch, record, self.mask.flags.shape[0], self.mask.voxel_m)
         self._field = self._mask = None
+        self.confirmed, self.doubts = False, 0
 
     def wake(self) -> None:
         """Come back into memory as it went.

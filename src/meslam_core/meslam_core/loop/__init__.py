@@ -1,0 +1,1 @@
+"""Places seen again: what they say of the path in between."""

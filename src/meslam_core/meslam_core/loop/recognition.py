@@ -1,0 +1,89 @@
+"""Whether a region that was come back to is where the camera believes it to be."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from meslam_core.frame import RgbdFrame
+from meslam_core.loop.pose_graph import MeasuredMotion, optimised_poses
+from meslam_core.mapping.covisibility import CovisibilityLink, CovisibilityLinker
+from meslam_core.mapping.keyframes import Rays
+from meslam_core.regions.atlas import RegionAtlas
+from meslam_core.regions.region import Region
+from meslam_core.se3 import inverse, rotation_angle
+
+log = logging.getLogger(__name__)
+
+# Where a region says that the camera is farther from where it is believed to be, the path since
+# is corrected; smaller differences training and links even out.
+TOLERATED_M = 0.02
+TOLERATED_RAD = 0.01
+# After so many keyframes that told nothing a region is believed to lie right.
+MOST_DOUBTS = 8
+
+
+class RegionRecogniser:
+    """Asks regions that woke whether they know the view, and corrects the path by the answer.
+
+    Until then such a region is not trained: what does not agree with its map would spoil it.
+
+    Args:
+        atlas: its regions are moved by corrections.
+        linker: finds a keyframe among older ones.
+
+    Attributes:
+        corrections: so many times the path was corrected.
+    """
+
+    def __init__(self, atlas: RegionAtlas, linker: CovisibilityLinker) -> None:
+        self.corrections = 0
+        self._atlas = atlas
+        self._keyframes = atlas.keyframes
+        self._linker = linker
+
+    def ask(self, region: Region, keyframe: int, frame: RgbdFrame, rays: Rays) -> None:
+        """Look for a new keyframe's view among those of a region that woke.
+
+        Args:
+            region: awake and not confirmed.
+            keyframe: number of the new one.
+            frame: its images.
+            rays: its sample, camera frame.
+        """
+        known = [each for each in region.keyframes if each != keyframe]
+        links = self._linker.recognise(keyframe, frame, rays, known)
+        region.doubts += 1
+        if links:
+            self._believe(links)
+        region.confirmed = bool(links) or region.doubts >= MOST_DOUBTS
+        if region.confirmed and not links:
+            log.warning("region %s was not recognised; its map is believed", region.index)
+
+    def _believe(self, links: list[CovisibilityLink]) -> None:
+        keyframes = self._keyframes
+        # The last one agreed with the others.
+        link = links[-1]
+        found = keyframes.pose(link.first) @ link.T_first_second
+        apart = inverse(keyframes.pose(link.second)) @ found
+        far = float(np.linalg.norm(apart[:3, 3]))
+        if far > TOLERATED_M or rotation_angle(apart) > TOLERATED_RAD:
+            loops = [MeasuredMotion(k.first, k.second, k.T_first_second) for k in links]
+            before = keyframes.poses()
+            after = optimised_poses(before, keyframes.links, loops)
+            everyone = np.arange(1, len(after))
+            keyframes.set_poses(
+                everyone,
+                after[1:, :3, :3].astype(np.float32),
+                after[1:, :3, 3].astype(np.float32),
+            )
+            self._atlas.correct(before, after)
+            self.corrections += 1
+            log.info(
+                "keyframe %d was recognised %.1f cm from where it was believed to be",
+                link.second,
+                far * 100,
+            )
+        for each in links:
+            keyframes.add_link(each.first, each.second, each.T_first_second)

@@ -1,0 +1,110 @@
+"""Regions that are come back to after the path has drifted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from data.textured_room import CAMERA, frame_at, path
+
+from meslam_core.config import MeslamConfig
+from meslam_core.loop.recognition import MOST_DOUBTS, RegionRecogniser
+from meslam_core.mapping.covisibility import CovisibilityLinker
+from meslam_core.mapping.keyframes import KeyframeStore, rays_at
+from meslam_core.regions.atlas import RegionAtlas
+from meslam_core.scratch import ScratchFile
+from meslam_core.se3 import Pose, exp, inverse, log
+from meslam_core.tracking.pixels import choose_pixels
+
+LARGE = CAMERA.scaled(2.0)
+CONFIG = MeslamConfig.from_overrides(
+    ["keyframes.rays=512", "field.backend=torch", "regions.mask_voxel_m=0.2"]
+)
+POSES = path(8, step_m=0.05, step_deg=1.5)
+DRIFT = exp(np.array([0.15, -0.2, 0.1, 0.01, -0.02, 0.03]))
+
+
+class Walk:
+    """Keyframes along a path that is believed to drift away from the truth."""
+
+    def __init__(self) -> None:
+        scratch = ScratchFile()
+        self.keyframes = KeyframeStore(512, torch.device("cpu"), scratch=scratch)
+        self.atlas = RegionAtlas(CONFIG, POSES[0][:3, 3], self.keyframes, 0, scratch)
+        self.linker = CovisibilityLinker(self.keyframes, CONFIG, scratch)
+        self.recogniser = RegionRecogniser(self.atlas, self.linker)
+        self._generator = np.random.default_rng(0)
+
+    def add(self, true: Pose, believed: Pose, linked: bool = True) -> tuple:
+        number = len(self.keyframes)
+        frame = frame_at(true, number, LARGE)
+        rays = rays_at(frame, *choose_pixels(frame.depth_m > 0, 512, self._generator))
+        self.keyframes.add(frame.stamp_ns, believed, rays)
+        if linked and number:
+            previous = inverse(self.keyframes.pose(number - 1)) @ believed
+            self.keyframes.add_link(number - 1, number, previous)
+        self.linker.link(number, frame, rays)
+        return number, frame, rays
+
+
+@pytest.fixture
+def returned() -> tuple[Walk, tuple]:
+    """A walk that is back at its start, believed elsewhere; the first region has just woken."""
+    walk = Walk()
+    away = [p @ exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(100.0), 0.0])) for p in POSES]
+    for pose in POSES:
+        walk.atlas.add_keyframe(walk.add(pose, pose)[0])
+    for share, pose in zip(np.linspace(0.0, 1.0, len(away)), away, strict=True):
+        walk.add(pose, exp(share * log(DRIFT)) @ pose)
+    back = POSES[3] @ exp(np.array([0.03, 0.02, 0.0, 0.0, 0.02, 0.0]))
+    latest = walk.add(back, DRIFT @ back)
+    walk.atlas.working.confirmed = False
+    return walk, (latest, back)
+
+
+def test_the_path_is_corrected_by_what_a_region_recognises(returned):
+    walk, (latest, back) = returned
+    region, before = walk.atlas.working, walk.keyframes.pose(10)
+    beside = inverse(walk.keyframes.pose(4)) @ region.T_map_region
+    weights = region.weights()
+    walk.recogniser.ask(region, *latest)
+    assert region.confirmed
+    assert walk.recogniser.corrections == 1
+    found = log(inverse(back) @ walk.keyframes.pose(latest[0]))
+    assert np.linalg.norm(found[:3]) < 0.02
+    assert np.linalg.norm(found[3:]) < 0.01
+    assert not np.allclose(walk.keyframes.pose(10), before, atol=1e-3)
+    # The region goes with its keyframes, and no network is trained for it.
+    kept = inverse(walk.keyframes.pose(4)) @ region.T_map_region
+    np.testing.assert_allclose(kept, beside, atol=0.02)
+    np.testing.assert_array_equal(region.weights(), weights)
+
+
+def test_a_region_that_lies_where_it_is_believed_is_confirmed_and_nothing_moves():
+    walk = Walk()
+    for pose in POSES:
+        walk.atlas.add_keyframe(walk.add(pose, pose)[0])
+    latest = walk.add(POSES[2], POSES[2])
+    poses = walk.keyframes.poses()
+    walk.atlas.working.confirmed = False
+    walk.recogniser.ask(walk.atlas.working, *latest)
+    assert walk.atlas.working.confirmed
+    assert walk.recogniser.corrections == 0
+    np.testing.assert_array_equal(walk.keyframes.poses(), poses)
+
+
+def test_a_view_that_a_region_does_not_know_moves_nothing_and_is_waited_for_only_so_long():
+    walk = Walk()
+    for pose in POSES:
+        walk.atlas.add_keyframe(walk.add(pose, pose)[0])
+    region = walk.atlas.working
+    region.confirmed = False
+    away = POSES[0] @ exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(100.0), 0.0]))
+    for number in range(MOST_DOUBTS):
+        assert not region.confirmed
+        # Believed to see what the region's keyframes saw.
+        latest = walk.add(away, POSES[2], linked=False)
+        walk.recogniser.ask(region, *latest)
+        assert region.doubts == number + 1
+    assert region.confirmed
+    assert walk.recogniser.corrections == 0

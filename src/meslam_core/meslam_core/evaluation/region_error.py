@@ -32,16 +32,20 @@ class RegionError:
         return asdict(self)
 
 
-def region_error(region: PlacedRegion, surface: NDArray[np.floating]) -> RegionError:
+def region_error(
+    region: PlacedRegion, surface: NDArray[np.floating], observed_only: bool = True
+) -> RegionError:
     """A region's error, whatever other regions say of the same place.
 
     Args:
         region: ready to answer.
         surface: (N, 3) points of the true surface, map frame [m].
+        observed_only: leave out what the region has not observed.
     """
     local = region.to_local(surface)
     local = local[(np.abs(local) < region.stored.half_side_m).all(axis=1)]
-    local = local[region.lookup(local) & OBSERVED > 0]
+    if observed_only:
+        local = local[region.lookup(local) & OBSERVED > 0]
     if not len(local):
         return RegionError(0, float("nan"), float("nan"))
     architecture = region.stored.architecture

@@ -13,6 +13,7 @@ from meslam_ros.odometry_messages import (
     UNKNOWN_VARIANCE,
     BaseMotion,
     OdometryBuffer,
+    estimate_at,
     from_odometry,
 )
 from meslam_ros.transforms import CameraMount
@@ -108,12 +109,12 @@ def test_buffer_answers_equal_stamps_at_once_and_waits_for_late_ones() -> None:
     buffer = OdometryBuffer()
     first, second = messages(2)
     buffer.add(first)
-    found = buffer.wait(0, MOUNT, 0.0)
+    found = estimate_at(0, buffer.wait(0, 0.0), MOUNT)
     assert found is not None
     assert found.stamp_ns == 0
-    assert buffer.wait(PERIOD_NS, MOUNT, 0.0) is None
+    assert estimate_at(PERIOD_NS, buffer.wait(PERIOD_NS, 0.0), MOUNT) is None
     threading.Timer(0.1, buffer.add, (second,)).start()
-    late = buffer.wait(PERIOD_NS, MOUNT, 5.0)
+    late = estimate_at(PERIOD_NS, buffer.wait(PERIOD_NS, 5.0), MOUNT)
     assert late is not None
     assert late.stamp_ns == PERIOD_NS
 
@@ -122,11 +123,20 @@ def test_faster_odometry_is_interpolated() -> None:
     buffer = OdometryBuffer()
     for message in messages(3):
         buffer.add(message)
-    between = buffer.wait(PERIOD_NS // 2, MOUNT, 0.0)
+    between = estimate_at(PERIOD_NS // 2, buffer.wait(PERIOD_NS // 2, 0.0), MOUNT)
     assert between is not None
     start = from_odometry(messages(1)[0], MOUNT)
     motion = log(inverse(start.T_odom_camera) @ between.T_odom_camera)
     np.testing.assert_allclose(motion, 0.5 * log(STEP), atol=1e-9)
+
+
+def test_the_longest_gap_is_the_users() -> None:
+    patient, strict = OdometryBuffer(PERIOD_NS), OdometryBuffer(PERIOD_NS - 1)
+    for message in messages(2):
+        patient.add(message)
+        strict.add(message)
+    assert len(patient.wait(PERIOD_NS // 2, 0.0)) == 2
+    assert strict.wait(PERIOD_NS // 2, 0.0) == ()
 
 
 @pytest.mark.parametrize("stamp", [-PERIOD_NS, 20 * PERIOD_NS])
@@ -134,12 +144,12 @@ def test_nothing_is_invented_outside_what_came(stamp: int) -> None:
     buffer = OdometryBuffer()
     for message in messages(3):
         buffer.add(message)
-    assert buffer.wait(stamp, MOUNT, 0.0) is None
+    assert buffer.wait(stamp, 0.0) == ()
 
 
 def test_odometry_that_starts_again_forgets_what_was() -> None:
     buffer = OdometryBuffer()
     for number in (100, 0):
         buffer.add(BaseMotion("odom").message(estimate(number), MOUNT))
-    assert buffer.wait(100 * PERIOD_NS, MOUNT, 0.0) is None
-    assert buffer.wait(0, MOUNT, 0.0) is not None
+    assert buffer.wait(100 * PERIOD_NS, 0.0) == ()
+    assert len(buffer.wait(0, 0.0)) == 1

@@ -12,8 +12,9 @@ from meslam_interfaces.srv import ListRegions
 from meslam_ros import topics
 from meslam_ros.client import MeslamClient
 from meslam_ros.processes import NodeProcess
-from meslam_ros.slam_node import NODES, child_arguments
+from meslam_ros.slam_node import NODES, child_arguments, needed_nodes
 
+ROOT = Path(__file__).parents[2]
 STARTING_S = 60.0
 ENDING_S = 20.0
 
@@ -71,6 +72,39 @@ def node_names(client: MeslamClient) -> list[str]:
 def test_arguments_reach_every_node_but_for_a_name() -> None:
     given = ["--ros-args", "-r", "__node:=slam", "-r", "__ns:=/robot", "-p", "queue_size:=3"]
     assert child_arguments(given) == ["--ros-args", "-r", "__ns:=/robot", "-p", "queue_size:=3"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["-p", "odometry_topic:=/wheels/odom"],
+        ["-p", "tracking_node:odometry_topic:=/wheels/odom"],
+        ["-p", "odometry.method:=none"],
+        ["--params-file", str(ROOT / "config" / "imap_star.yaml")],
+    ],
+)
+def test_odometry_from_elsewhere_or_none_needs_no_odometry_node(arguments) -> None:
+    assert "odometry_node" not in needed_nodes(["--ros-args", *arguments])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--ros-args", "--params-file", str(ROOT / "config" / "meslam.yaml")],
+        # The nodes say themselves what is wrong with their parameters.
+        ["--ros-args", "-p", "odometry_topic:=3"],
+        ["--ros-args", "--params-file", "/nowhere.yaml"],
+    ],
+)
+def test_otherwise_all_nodes_are_needed(arguments) -> None:
+    assert needed_nodes(arguments) == NODES
+
+
+def test_no_odometry_node_runs_beside_wheels(start) -> None:
+    slam = start("--ros-args", "-p", "odometry_topic:=/wheels/odom")
+    assert wait_until(lambda: len(children(slam.pid)) == 3, STARTING_S), slam.output()
+    assert "odometry_node" not in children(slam.pid)
 
 
 def test_four_nodes_start_restart_and_end_together(start, client) -> None:

@@ -4,25 +4,36 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from data.drifting_odometry import drifting
 from data.ros_camera import BASE_FRAME, OPTICAL_FRAME, CameraDriver, Messages
-from data.textured_room import frame_at, path
+from data.textured_room import PERIOD_NS, frame_at, path
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.qos import ReliabilityPolicy
+from nav_msgs.msg import Odometry
+from rclpy.qos import ReliabilityPolicy, qos_profile_sensor_data
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
 from meslam_core.config import MeslamConfig
-from meslam_core.se3 import inverse
+from meslam_core.se3 import exp, inverse
 from meslam_core.slam import T_BODY_OPTICAL
+from meslam_core.trajectory import Trajectory
 from meslam_interfaces.msg import RegionModel, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.client import MeslamClient
-from meslam_ros.conversions import NANOSECONDS, byte_array, stamp_ns, to_stamp
+from meslam_ros.conversions import (
+    NANOSECONDS,
+    byte_array,
+    from_transform,
+    stamp_ns,
+    to_pose,
+    to_stamp,
+)
 from meslam_ros.odometry_node import OdometryNode
 from meslam_ros.qos import STREAM, latched
 from meslam_ros.region_messages import stored_region
 from meslam_ros.tracking_node import TrackingNode
+from meslam_ros.transforms import StaticBroadcaster
 
 POSES = path(12)
 FAST = {
@@ -142,6 +153,67 @@ def rotation(x: float, y: float, z: float, w: float) -> np.ndarray:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def test_wheels_take_the_place_of_odometry_in_their_own_frames(start_node, client) -> None:
+    """The camera sits aside on a robot whose wheels count in a frame of their own."""
+    start_node(TrackingNode, **FAST | {"odometry_topic": "wheels/odom"})
+    T_robot_base = exp(np.array([0.3, -0.1, 0.5, 0.0, 0.2, 0.4]))
+    T_wheels_map = exp(np.array([-4.0, 7.0, 0.0, 0.0, 0.0, 2.0]))
+    kept = StaticBroadcaster(client.node, T_robot_base, "robot", BASE_FRAME)
+    wheels = client.node.create_publisher(Odometry, "wheels/odom", qos_profile_sensor_data)
+    transforms: list[TFMessage] = []
+    client.node.create_subscription(TFMessage, topics.TF, transforms.append, STREAM)
+    camera = Camera(client)
+    camera.wait()
+    assert client.spin_until(lambda: wheels.get_subscription_count() > 0, ANSWER_S), kept
+    T_base_robot = inverse(T_robot_base)
+    drifted = drifting(Trajectory(np.arange(len(POSES)), np.array(POSES)))
+    T_wheels_first = T_wheels_map @ POSES[0] @ inverse(drifted.poses[0])
+    for number, pose in enumerate(drifted.poses):
+        T_wheels_robot = T_wheels_first @ pose @ inverse(T_BODY_OPTICAL) @ T_base_robot
+        message = Odometry(child_frame_id="robot")
+        message.header.frame_id = "wheels"
+        message.header.stamp = to_stamp(NANOSECONDS + number * PERIOD_NS)
+        message.pose.pose = to_pose(T_wheels_robot)
+        wheels.publish(message)
+    # The image in between is not one of those that the wheels reported for.
+    numbers = [0, 2, 5, 8, 10]
+    statuses = [camera.track(number, later_ns=number * 1_000_000) for number in numbers]
+    assert [status.odometry_valid for status in statuses] == [True] * len(numbers)
+    assert all(status.state == TrackingStatus.OK for status in statuses)
+    assert client.spin_until(lambda: len(client.poses) == len(numbers), ANSWER_S)
+    for stamp, T_map_base in client.poses.items():
+        truth = POSES[(stamp - NANOSECONDS) // PERIOD_NS] @ inverse(T_BODY_OPTICAL)
+        assert np.linalg.norm((inverse(truth) @ T_map_base)[:3, 3]) < 0.015
+    edges = {(t.header.frame_id, t.child_frame_id) for m in transforms for t in m.transforms}
+    assert edges == {("map", "wheels")}
+    T_map_wheels = from_transform(transforms[-1].transforms[0].transform)
+    assert np.linalg.norm((T_map_wheels @ T_wheels_map)[:3, 3]) < 0.1
+
+
+def test_wheels_that_nothing_connects_to_the_camera_are_named(start_node, client, capfd) -> None:
+    start_node(TrackingNode, **FAST | {"odometry_topic": "wheels/odom"})
+    wheels = client.node.create_publisher(Odometry, "wheels/odom", STREAM)
+    camera = Camera(client)
+    camera.wait()
+    assert client.spin_until(lambda: wheels.get_subscription_count() > 0, ANSWER_S)
+    message = Odometry(child_frame_id="nowhere")
+    message.header.stamp = to_stamp(NANOSECONDS)
+    wheels.publish(message)
+    status = camera.track(0)
+    assert status.state == TrackingStatus.OK
+    assert not status.odometry_valid
+    assert "'nowhere'" in capfd.readouterr().err
+
+
+def test_a_preset_without_odometry_waits_for_none(start_node, client, capfd) -> None:
+    start_node(TrackingNode, **FAST | {"odometry__method": "none"})
+    camera = Camera(client)
+    camera.wait()
+    statuses = [camera.track(number) for number in range(3)]
+    assert all(status.state == TrackingStatus.OK for status in statuses)
+    assert "odometry" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("give_way", [True, False])
@@ -281,9 +353,7 @@ def test_silence_is_explained(start_node, client, capfd) -> None:
 def test_depth_of_another_camera_is_registered(start_node, client) -> None:
     """Depth with its own intrinsics and place, as a D435 without align_depth sends it."""
     from meslam_core.camera import PinholeCamera
-    from meslam_core.se3 import exp
     from meslam_ros.conversions import camera_to_info, depth_message
-    from meslam_ros.transforms import StaticBroadcaster
 
     start_node(TrackingNode, **FAST)
     depth_camera = PinholeCamera(128, 96, 100.0, 100.0, 63.5, 47.5)

@@ -13,6 +13,8 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
 from launch.conditions import IfCondition
 from launch.substitutions import (
+    EqualsSubstitution,
+    IfElseSubstitution,
     LaunchConfiguration,
     NotEqualsSubstitution,
     PathJoinSubstitution,
@@ -30,6 +32,10 @@ ARGUMENTS = {
     "params_file": (os.path.join(SHARE, "config", "meslam.yaml"), "parameters of all nodes"),
     "export_folder": ("meslam_exports", "export_map writes below it"),
     "map_folder": ("meslam_maps", "save_map and load_map use it"),
+    "odometry_topic": (
+        "",
+        "nav_msgs/Odometry from elsewhere, such as wheels, instead of the odometry node",
+    ),
     "use_sim_time": ("false", "take the time from /clock"),
 }
 IMAGE_TOPICS = (
@@ -53,7 +59,9 @@ def generate_launch_description() -> LaunchDescription:
         "base_frame": given["base_frame"],
         "export_folder": given["export_folder"],
         "map_folder": given["map_folder"],
+        "odometry_topic": given["odometry_topic"],
     }
+    own_odometry = IfCondition(EqualsSubstitution(given["odometry_topic"], ""))
     nodes = [
         Node(
             package="meslam_ros",
@@ -62,6 +70,7 @@ def generate_launch_description() -> LaunchDescription:
             parameters=[given["params_file"], parameters],
             remappings=remappings,
             output="screen",
+            condition=own_odometry if name == "odometry_node" else None,
         )
         for name in NODES
     ]
@@ -74,8 +83,10 @@ def generate_launch_description() -> LaunchDescription:
                 "recording": given["recording"],
                 "rate": given["rate"],
                 "base_frame": given["base_frame"],
-                # The odometry and the tracking.
-                "subscribers": 2,
+                # The tracking, and the odometry where it runs.
+                "subscribers": IfElseSubstitution(
+                    EqualsSubstitution(given["odometry_topic"], ""), "2", "1"
+                ),
             }
         ],
         remappings=remappings,

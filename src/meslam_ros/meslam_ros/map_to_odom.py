@@ -24,7 +24,7 @@ class MapToOdom:
 
     Args:
         node: that broadcasts.
-        map_frame, odom_frame: parent and child.
+        map_frame, odom_frame: parent and child; an update may change the child.
         rate_hz: of repetition.
     """
 
@@ -46,9 +46,10 @@ class MapToOdom:
             self._stamp_ns: int | None = None
             self._updated_s = 0.0
 
-    def update(self, stamp_ns: int, T_map_odom: se3.Pose | None) -> None:
+    def update(self, stamp_ns: int, T_map_odom: se3.Pose | None, odom_frame: str) -> None:
         """Take and send the correction as of an image; None keeps the one before."""
         with self._lock:
+            self._odom_frame = odom_frame
             if T_map_odom is not None:
                 self._T_map_odom = T_map_odom
             self._stamp_ns, self._updated_s = stamp_ns, time.monotonic()

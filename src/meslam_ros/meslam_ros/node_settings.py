@@ -76,6 +76,12 @@ class TrackingSettings:
         minimum=1,
         maximum=1000,
     )
+    odometry_topic: str = setting(
+        "",
+        "nav_msgs/Odometry from elsewhere (wheels, a tracking camera) instead of the odometry "
+        "node, which then is not needed; /tf_static must connect its child frame to the camera, "
+        "and `odometry.given_*` say how far it errs; empty takes the odometry node's",
+    )
     odometry_timeout_s: float = setting(
         2.0,
         "how long an image pair waits for its odometry before it is tracked without",

@@ -86,9 +86,14 @@ def _flat(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class OdometryBuffer:
-    """Odometry messages by stamp, filled by the executor and waited for by the worker."""
+    """Odometry messages by stamp, filled by the executor and waited for by the worker.
 
-    def __init__(self) -> None:
+    Args:
+        max_gap_ns: nothing is interpolated between messages that are farther apart [ns].
+    """
+
+    def __init__(self, max_gap_ns: int = MAX_GAP_NS) -> None:
+        self._max_gap_ns = max_gap_ns
         self._stamps: list[int] = []
         self._messages: dict[int, Odometry] = {}
         self._changed = threading.Condition()
@@ -114,17 +119,16 @@ class OdometryBuffer:
             self._stamps.clear()
             self._messages.clear()
 
-    def wait(self, stamp: int, mount: CameraMount, timeout_s: float) -> OdometryEstimate | None:
-        """The camera's odometry at a stamp [ns].
+    def wait(self, stamp: int, timeout_s: float) -> tuple[Odometry, ...]:
+        """What is known of a stamp [ns].
 
         Args:
             stamp: of the image [ns].
-            mount: of the camera on the base whose odometry it is.
             timeout_s: how long to wait for a message at or after the stamp [s].
 
         Returns:
-            The message with this stamp, or one interpolated between its neighbours where those
-            are close; None when there is none in time.
+            The message with this stamp, or its two neighbours where those are close; nothing when
+            there is none in time.
         """
         with self._changed:
             self._changed.wait_for(
@@ -132,15 +136,31 @@ class OdometryBuffer:
                 timeout_s,
             )
             if stamp in self._messages:
-                return from_odometry(self._messages[stamp], mount)
+                return (self._messages[stamp],)
             place = bisect_left(self._stamps, stamp)
             if not 0 < place < len(self._stamps):
-                return None
+                return ()
             before, after = self._stamps[place - 1], self._stamps[place]
-            if after - before > MAX_GAP_NS:
-                return None
-            first, second = self._messages[before], self._messages[after]
-        return _interpolated(stamp, first, second, mount)
+            if after - before > self._max_gap_ns:
+                return ()
+            return self._messages[before], self._messages[after]
+
+
+def estimate_at(
+    stamp: int, messages: tuple[Odometry, ...], mount: CameraMount
+) -> OdometryEstimate | None:
+    """The camera's odometry at a stamp [ns].
+
+    Args:
+        stamp: of the image [ns].
+        messages: what is known of it (`OdometryBuffer.wait`).
+        mount: of the camera on the base whose odometry it is.
+    """
+    if not messages:
+        return None
+    if len(messages) == 1:
+        return from_odometry(messages[0], mount)
+    return _interpolated(stamp, *messages, mount)
 
 
 def from_odometry(message: Odometry, mount: CameraMount) -> OdometryEstimate:

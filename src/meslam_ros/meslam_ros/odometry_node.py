@@ -8,6 +8,7 @@ from typing import Any
 
 from nav_msgs.msg import Odometry
 
+from meslam_core.errors import ConfigError
 from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import OdometryEstimate, make_odometry
 from meslam_core.threads import limit_threads
@@ -34,6 +35,10 @@ class OdometryNode(ManagedNode):
         self._inputs = declare_settings(self, InputSettings)
         self._settings = declare_settings(self, OdometrySettings)
         self._config = declare_config(self, ("sensor", "odometry", "runtime"))
+        if self._config.odometry.method == "none":
+            raise ConfigError(
+                "odometry.method = none leaves nothing to do for odometry_node; do not start it"
+            )
         limit_threads(self._config.runtime.threads)
 
     def configure(self) -> None:

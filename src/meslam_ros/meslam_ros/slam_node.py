@@ -1,4 +1,4 @@
-"""`slam_node`: all four nodes at once, each in a process of its own."""
+"""`slam_node`: all nodes that are needed at once, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -8,7 +8,16 @@ import threading
 import time
 from collections.abc import Sequence
 
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from meslam_core.errors import MeslamError
 from meslam_ros.managed_node import USAGE_ERROR
+from meslam_ros.node_settings import TrackingSettings
+from meslam_ros.parameters import declare_config, declare_settings
 from meslam_ros.processes import STOPPING_S, NodeProcess
 
 NODES = ("map_server_node", "region_manager_node", "odometry_node", "tracking_node")
@@ -26,6 +35,37 @@ def child_arguments(arguments: Sequence[str]) -> list[str]:
         elif kept and kept[-1] in ("-r", "--remap"):
             kept.pop()
     return kept
+
+
+def needed_nodes(arguments: Sequence[str]) -> tuple[str, ...]:
+    """Those of `NODES` that the arguments leave something to do.
+
+    rcl itself tells what the tracking node would be given, by command line or parameter file.
+
+    Args:
+        arguments: for all nodes.
+    """
+    context = Context()
+    try:
+        rclpy.init(
+            args=[sys.argv[0], *arguments],
+            context=context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        node = Node(
+            "tracking_node", context=context, enable_rosout=False, start_parameter_services=False
+        )
+        given = declare_settings(node, TrackingSettings).odometry_topic
+        method = declare_config(node, ("odometry",)).odometry.method
+        node.destroy_node()
+    except (MeslamError, ParameterException, RuntimeError):
+        # The nodes themselves say what is wrong.
+        return NODES
+    finally:
+        context.try_shutdown()
+    if given or method == "none":
+        return tuple(name for name in NODES if name != "odometry_node")
+    return NODES
 
 
 class Child:
@@ -69,7 +109,9 @@ class Supervisor:
         """Run until a signal, or a node that cannot be kept running; the exit status."""
         status = 0
         try:
-            self._children = [Child(name, self._arguments) for name in NODES]
+            self._children = [
+                Child(name, self._arguments) for name in needed_nodes(self._arguments)
+            ]
             while status == 0 and not self._stopping.wait(POLL_S):
                 status = self._check()
         finally:

@@ -7,26 +7,25 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 from std_srvs.srv import SetBool, Trigger
 
 from meslam_core import se3
 from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
-from meslam_core.odometry import OdometryEstimate
 from meslam_core.slam import FrameResult, TrackingState
 from meslam_core.threads import limit_threads
 from meslam_interfaces.msg import RegionIndex, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
-from meslam_ros.frame_worker import WARNING_PERIOD_S, FrameWorker
+from meslam_ros.frame_worker import FrameWorker
 from meslam_ros.image_synchronizer import ImagePair
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.map_to_odom import MapToOdom
 from meslam_ros.mapping_session import MappingSession
 from meslam_ros.model_publisher import ModelPublisher
 from meslam_ros.node_settings import FrameSettings, InputSettings, TrackingSettings
-from meslam_ros.odometry_messages import OdometryBuffer
+from meslam_ros.odometry_source import OdometrySource
 from meslam_ros.parameters import declare_config, declare_settings
 from meslam_ros.qos import STREAM, latched
 from meslam_ros.rgbd_input import STEADY
@@ -71,9 +70,12 @@ class TrackingNode(ManagedNode):
         self._map_to_odom = MapToOdom(
             self, frames.map_frame, frames.odom_frame, settings.transform_rate_hz
         )
-        self._odometry = OdometryBuffer()
-        self._odometry_subscription = self.create_subscription(
-            Odometry, topics.ODOMETRY, self._odometry.add, STREAM
+        self._odometry = OdometrySource(
+            self,
+            settings.odometry_topic,
+            frames.odom_frame,
+            self._config.odometry,
+            settings.odometry_timeout_s,
         )
         self._reset = self.create_service(Trigger, topics.RESET, self._on_reset)
         self._pause = self.create_service(SetBool, topics.PAUSE, self._on_pause)
@@ -96,7 +98,7 @@ class TrackingNode(ManagedNode):
         self._models.close()
         self._map_to_odom.close()
         self._diagnostics.close()
-        self.destroy_subscription(self._odometry_subscription)
+        self._odometry.close()
         for service in (self._reset, self._pause):
             self.destroy_service(service)
         for publisher in (self._pose, self._covariance, self._path, self._status):
@@ -133,7 +135,7 @@ class TrackingNode(ManagedNode):
             session.discarded["paused"] += 1
             self.refuse(pair, "paused")
             return
-        odometry = self._odometry_of(frame, mount)
+        odometry = self._odometry.estimate(frame, mount, self._worker.input.transforms)
         result = session.track(frame, mount, odometry)
         if session.has_pose:
             self._publish_pose(result)
@@ -176,22 +178,6 @@ class TrackingNode(ManagedNode):
         self._latest_status.map_bytes = self._models.map_bytes
         self._status.publish(self._latest_status)
 
-    def _odometry_of(self, frame: RgbdFrame, mount: CameraMount) -> OdometryEstimate | None:
-        if not self.count_publishers(self._odometry_subscription.topic_name):
-            self.get_logger().warn(
-                f"nobody publishes {self._odometry_subscription.topic_name}: tracking without "
-                "odometry",
-                throttle_duration_sec=10 * WARNING_PERIOD_S,
-            )
-            return None
-        odometry = self._odometry.wait(frame.stamp_ns, mount, self._settings.odometry_timeout_s)
-        if odometry is None:
-            self.get_logger().warn(
-                f"no odometry came for the image at {frame.stamp_s:.3f} s: tracked without",
-                throttle_duration_sec=WARNING_PERIOD_S,
-            )
-        return odometry
-
     def _publish_pose(self, result: FrameResult) -> None:
         head = header(result.stamp_ns, self._frames.map_frame)
         T_map_camera, odometry = result.T_map_camera, result.odometry
@@ -203,7 +189,7 @@ class TrackingNode(ManagedNode):
         T_map_odom = None
         if odometry is not None:
             T_map_odom = T_map_camera @ se3.inverse(odometry.T_odom_camera)
-        self._map_to_odom.update(result.stamp_ns, T_map_odom)
+        self._map_to_odom.update(result.stamp_ns, T_map_odom, self._odometry.odom_frame)
 
     def _publish_status(self, status: TrackingStatus, latency_s: float) -> None:
         """Add what the node counts to what is known of a frame, and publish it."""

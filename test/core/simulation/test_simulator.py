@@ -12,6 +12,7 @@ from meslam_core.evaluation.reconstruction import distances
 from meslam_core.recordings.recording import Recording
 from meslam_core.recordings.registry import open_recording
 from meslam_core.se3 import inverse
+from meslam_core.simulation.scenes import build_scene
 from meslam_core.simulation.sensor import D435_CAMERA
 from meslam_core.simulation.simulator import Simulation, simulate
 from meslam_core.simulation.writer import surface_path, truth_path, write_simulation
@@ -95,6 +96,21 @@ def test_colors_of_a_point_agree_between_views():
     still = np.abs(first.color.astype(float) - second.color).mean()
     assert np.median(difference) < 3.0
     assert difference.mean() < 0.35 * still
+
+
+def test_without_a_duration_the_camera_goes_round_once():
+    simulation = simulate("corridor", camera=CAMERA)
+    assert len(simulation) == round(build_scene("corridor").route.round_s * simulation.fps)
+    first, last = simulation.truth.poses[[0, -1]]
+    assert np.linalg.norm(first[:3, 3] - last[:3, 3]) < 0.05
+
+
+def test_corridor_has_little_texture():
+    def contrast(name: str) -> float:
+        frames = simulate(name, camera=CAMERA, noise=False).frames(0, None, 60)
+        return float(np.mean([cv2.Laplacian(f.color, cv2.CV_32F).std() for f in frames]))
+
+    assert contrast("corridor") < 0.5 * contrast("room")
 
 
 def test_motion_blur_smears_along_the_motion_only_on_request():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 
 import cv2
 import numpy as np
@@ -17,6 +19,8 @@ LEVELS = 4
 
 GUTTER = 2 ** (LEVELS - 1)
 """Border of repeated texels round a patch [px], so that coarse levels do not mix neighbours."""
+
+PAINT_THREADS = 2
 
 LOOKUP_ROW = 1024
 """Columns of the maps that scattered points are looked up with; OpenCV wants small images."""
@@ -91,16 +95,17 @@ class Atlas:
     ) -> None:
         # The coarser levels lie side by side below the finest.
         self._image = np.zeros((layout.height + layout.height // 2, layout.width, 3), np.uint8)
-        for index, (patch, light) in enumerate(zip(patches, irradiance, strict=True)):
-            columns, rows = (int(n) for n in layout.sizes[index])
-            rng = np.random.default_rng((seed, index))
-            painted = patch.texture(Canvas(patch.width_m, patch.height_m, rows, columns, rng))
-            # Colours are display-referred: light acts before the display's gamma.
-            shade = _stretched(light, columns, rows) ** np.float32(1 / 2.2)
-            lit = np.clip(painted * (255 * shade[..., None]) + 0.5, 0, 255).astype(np.uint8)
-            lit = np.pad(lit, ((GUTTER, GUTTER), (GUTTER, GUTTER), (0, 0)), mode="edge")
-            left, top = layout.corners[index] - GUTTER
-            self._image[top : top + lit.shape[0], left : left + lit.shape[1]] = lit
+        with ThreadPoolExecutor(PAINT_THREADS) as pool:
+            list(
+                pool.map(
+                    self._paint,
+                    repeat(layout),
+                    repeat(seed),
+                    range(len(patches)),
+                    patches,
+                    irradiance,
+                )
+            )
         corners = np.zeros((LEVELS, 2))
         level, left = self._image[: layout.height], 0
         for index in range(1, LEVELS):
@@ -112,6 +117,20 @@ class Atlas:
         scales = 0.5 ** np.arange(LEVELS)
         shifts = corners.T + 0.5 * scales - 0.5
         self._levels = np.concatenate([scales[None], shifts]).astype(np.float32)
+
+    def _paint(
+        self, layout: Layout, seed: int, index: int, patch: Patch, light: NDArray[np.float32]
+    ) -> None:
+        """Paint and light one patch in its place of the finest level."""
+        columns, rows = (int(n) for n in layout.sizes[index])
+        rng = np.random.default_rng((seed, index))
+        painted = patch.texture(Canvas(patch.width_m, patch.height_m, rows, columns, rng))
+        # Colours are display-referred: light acts before the display's gamma.
+        shade = _stretched(light, columns, rows) ** np.float32(1 / 2.2)
+        lit = np.clip(painted * (255 * shade[..., None]) + 0.5, 0, 255).astype(np.uint8)
+        lit = np.pad(lit, ((GUTTER, GUTTER), (GUTTER, GUTTER), (0, 0)), mode="edge")
+        left, top = layout.corners[index] - GUTTER
+        self._image[top : top + lit.shape[0], left : left + lit.shape[1]] = lit
 
     def lookup(
         self,

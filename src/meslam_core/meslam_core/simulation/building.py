@@ -128,6 +128,10 @@ def _corridor() -> tuple[list[Patch], list[Lamp]]:
         paper = PAPERS[(3, 1, 4, 0)[turn]]
         patches.append(CORRIDOR.wall(side).face(paper, 0.003, openings))
     ceiling = textures.checker((0.86, 0.86, 0.84), (0.76, 0.76, 0.75), 0.6)
-    patches += CORRIDOR.floor_and_ceiling(textures.checker((0.62, 0.56, 0.48), (0.44, 0.40, 0.38), 0.4), ceiling)
+    patches += CORRIDOR.floor_and_ceiling(
+        textures.checker((0.62, 0.56, 0.48), (0.44, 0.40, 0.38), 0.4), ceiling
+    )
     patches += building_rooms.corridor(CORRIDOR)
-    return patches, [Lamp((x, 1.1, HEIGHT_M - 0.1), 0.4, 4.0, 6.0) for x in np.arange(2.2, 26.0, 4.3)]
+    return patches, [
+        Lamp((x, 1.1, HEIGHT_M - 0.1), 0.4, 4.0, 6.0) for x in np.arange(2.2, 26.0, 4.3)
+    ]

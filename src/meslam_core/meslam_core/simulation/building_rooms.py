@@ -41,7 +41,9 @@ def _study(room: Chamber) -> list[Patch]:
 
 
 def _dining_room(room: Chamber) -> list[Patch]:
-    patches = dining((7.98, 3.5), 0.05, RED, WALNUT) + carpet((7.98, 3.5), (2.0, 1.5), BLUE_RUG, 0.05)
+    patches = dining((7.98, 3.5), 0.05, RED, WALNUT) + carpet(
+        (7.98, 3.5), (2.0, 1.5), BLUE_RUG, 0.05
+    )
     patches += shelf(room, "north", 4.2, 1.8, 1.9, seed=12, color=OAK)
     patches += cupboard(room, "east", 1.25, 1.2, 1.8) + window(room, "north", 2.0)
     patches += pictures(room, "south", (1.2, 2.2, 0.6, 0.9), (2.4, 2.1, 0.9, 0.7))
@@ -136,13 +138,17 @@ def corridor(room: Chamber) -> list[Patch]:
     for number, (side, along) in enumerate(
         (("south", 17.0), ("north", 9.5), ("south", 9.3), ("north", 17.2), ("south", 4.4))
     ):
-        patches += shelf(room, side, along, 1.6, 1.15, seed=30 + number, color=(OAK, BIRCH)[number % 2])
+        patches += shelf(
+            room, side, along, 1.6, 1.15, seed=30 + number, color=(OAK, BIRCH)[number % 2]
+        )
     rng = np.random.default_rng(7)
     for side in ("south", "north"):
         for along in np.arange(3.2, 19.6, 1.35):
             width, height = rng.uniform(0.5, 0.9), rng.uniform(0.5, 0.8)
             patches += pictures(room, side, (float(along), 2.15, float(width), float(height)))
-    patches += pictures(room, "west", (1.1, 2.1, 1.2, 0.9)) + pictures(room, "east", (1.1, 2.1, 1.2, 0.9))
+    patches += pictures(room, "west", (1.1, 2.1, 1.2, 0.9)) + pictures(
+        room, "east", (1.1, 2.1, 1.2, 0.9)
+    )
     for position in ((0.51, 0.45), (14.2, 1.85), (25.6, 0.4)):
         patches += furniture.plant(position, 1.2)
     return patches + cartons((24.97, 1.8), 0.1) + cartons((4.1, 0.35), 0.0)

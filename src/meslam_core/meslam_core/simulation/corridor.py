@@ -57,18 +57,26 @@ def _inner_walls() -> list[Wall]:
 
 def _doors(walls: list[Wall], spacing: float, first: int) -> list[Patch]:
     """Closed doors with frames, and every wall's skirting."""
-    frame, leaf = textures.plaster((0.62, 0.64, 0.66), 0.01), textures.plaster((0.72, 0.66, 0.56), 0.015)
+    frame, leaf = (
+        textures.plaster((0.62, 0.64, 0.66), 0.01),
+        textures.plaster((0.72, 0.66, 0.56), 0.015),
+    )
     patches: list[Patch] = []
     for number, wall in enumerate(walls, first):
         patches += box(
-            wall.point(wall.length_m / 2, 0.04, 0.006), (wall.length_m, 0.012, 0.08), frame, yaw=wall.yaw
+            wall.point(wall.length_m / 2, 0.04, 0.006),
+            (wall.length_m, 0.012, 0.08),
+            frame,
+            yaw=wall.yaw,
         )
         for along in np.arange(1.4 + 0.35 * (number % 3), wall.length_m - 1.2, spacing):
             patches += box(wall.point(along, 1.02, 0.01), (0.9, 0.02, 2.04), leaf, yaw=wall.yaw)
             for side in (-0.49, 0.49):
                 post = wall.point(along + side, 1.05, 0.025)
                 patches += box(post, (0.08, 0.05, 2.10), frame, yaw=wall.yaw)
-            patches += box(wall.point(along, 2.08, 0.025), (0.9, 0.05, 0.08), frame, yaw=wall.yaw, without=())
+            patches += box(
+                wall.point(along, 2.08, 0.025), (0.9, 0.05, 0.08), frame, yaw=wall.yaw, without=()
+            )
             handle = wall.point(along + 0.36, 1.02, 0.05)
             patches += box(handle, (0.13, 0.03, 0.03), frame, yaw=wall.yaw, without=())
     return patches
@@ -77,15 +85,24 @@ def _doors(walls: list[Wall], spacing: float, first: int) -> list[Patch]:
 def _fittings() -> list[Patch]:
     """Radiators, extinguishers, a bench and a few notices."""
     south, east, north, west = _outer_walls()
-    white, red = textures.plaster((0.88, 0.88, 0.86), 0.01), textures.plaster((0.70, 0.16, 0.14), 0.02)
+    white, red = (
+        textures.plaster((0.88, 0.88, 0.86), 0.01),
+        textures.plaster((0.70, 0.16, 0.14), 0.02),
+    )
     patches: list[Patch] = []
     for wall, along in ((south, 3.2), (east, 5.6), (north, 6.4), (west, 2.7)):
-        patches += box(wall.point(along, 0.42, 0.08), (1.1, 0.10, 0.56), white, yaw=wall.yaw, without=())
+        patches += box(
+            wall.point(along, 0.42, 0.08), (1.1, 0.10, 0.56), white, yaw=wall.yaw, without=()
+        )
         patches.append(wall.hung(along + 0.9, 1.75, 0.30, 0.42, textures.poster(), 0.002, gap=0.01))
         patches += cylinder(wall.point(along - 1.0, 0.45, 0.12), 0.08, 0.5, red)
     seat = textures.wood((0.66, 0.56, 0.42), contrast=0.06)
     for wall, along in ((south, 8.6), (north, 9.4)):
-        patches += box(wall.point(along, 0.43, 0.20), (1.4, 0.34, 0.04), seat, yaw=wall.yaw, without=())
+        patches += box(
+            wall.point(along, 0.43, 0.20), (1.4, 0.34, 0.04), seat, yaw=wall.yaw, without=()
+        )
         for end in (-0.6, 0.6):
-            patches += box(wall.point(along + end, 0.205, 0.20), (0.05, 0.30, 0.41), seat, yaw=wall.yaw)
+            patches += box(
+                wall.point(along + end, 0.205, 0.20), (0.05, 0.30, 0.41), seat, yaw=wall.yaw
+            )
     return patches

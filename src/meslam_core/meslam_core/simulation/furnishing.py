@@ -8,7 +8,7 @@ import numpy as np
 
 from meslam_core.simulation import furniture, textures
 from meslam_core.simulation.canvas import Color
-from meslam_core.simulation.furniture import BIRCH, OAK, WALNUT
+from meslam_core.simulation.furniture import BIRCH
 from meslam_core.simulation.scene import Patch, box, cylinder, sphere
 from meslam_core.simulation.textures import Texture
 from meslam_core.simulation.walls import Chamber
@@ -31,7 +31,12 @@ def pictures(room: Chamber, side: str, *frames: tuple[float, float, float, float
 
 
 def shelf(
-    room: Chamber, side: str, along: float, width: float, height: float, seed: int,
+    room: Chamber,
+    side: str,
+    along: float,
+    width: float,
+    height: float,
+    seed: int,
     color: Color = BIRCH,
 ) -> list[Patch]:
     """A bookshelf against a wall."""

@@ -34,12 +34,12 @@ def _route() -> Route:
             1.95 + 0.60 * np.sin(2 * phase),
             1.38 + 0.12 * np.sin(phase + 0.8),
             -2 * phase + 0.12 * np.sin(3 * phase),
-            np.radians(7.5 + 23.3 * np.tanh(2 * np.sin(phase - 0.167))),
+            np.radians(7 + 24.5 * np.tanh(2 * np.sin(phase - 0.147))),
         ],
         axis=1,
     )
     once = Route(anchors)
-    return Route(anchors, once.round_m / ROUND_S, spread=(0.03, 0.03, 0.05, 0.03, 0.03))
+    return Route(anchors, once.round_m / ROUND_S, spread=(0.025, 0.025, 0.04, 0.025, 0.02))
 
 
 def _shell() -> list[Patch]:

@@ -92,19 +92,23 @@ def _irradiance(
     """Ambient light that corners lack, plus what every lamp sends without being blocked."""
     start = points + 2e-3 * normals
     total = np.zeros(len(points))
-    sky = _hemisphere()
+    sky, (tangents, others) = _hemisphere(), _tangents(normals)
     for direction in sky:
-        turned = _turned(direction, normals)
+        turned = direction[0] * tangents + direction[1] * others + direction[2] * normals
         total += scene.ambient / len(sky) * ~_blocked(caster, start, turned, CORNER_REACH_M)
     for lamp in scene.lamps:
         samples = _lamp_points(lamp)
-        near = np.linalg.norm(start - lamp.center, axis=1) < lamp.reach_m
-        lit = start[near]
+        # A margin round the square, so that facing it is not decided by its middle alone.
+        toward = lamp.center - start
+        near = (toward**2).sum(1) < lamp.reach_m**2
+        near &= (toward * normals).sum(1) > -lamp.side_m
+        near &= toward[:, 2] > 0
+        lit, facing = start[near], normals[near]
         for sample in samples:
             toward = sample - lit
             squared = (toward**2).sum(1)
             distance = np.sqrt(squared)
-            received = (toward * normals[near]).sum(1) / distance
+            received = (toward * facing).sum(1) / distance
             sent = toward[:, 2] / distance
             power = lamp.power / len(samples) * received.clip(0) * sent.clip(0) / squared.clip(0.05)
             total[near] += power * ~_blocked(caster, lit, toward, 1.0)
@@ -131,15 +135,12 @@ def _hemisphere() -> NDArray[np.float64]:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], 1)
 
 
-def _turned(direction: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A direction about +z turned to be about each normal (N, 3)."""
+def _tangents(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two unit vectors (N, 3) each that complete every normal (N, 3) to a frame."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    tangent = np.cross(helper, normals)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    other = np.cross(normals, tangent)
-    return np.asarray(
-        direction[0] * tangent + direction[1] * other + direction[2] * normals, np.float64
-    )
+    tangents = np.cross(helper, normals)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    return tangents, np.cross(normals, tangents)
 
 
 def _lamp_points(lamp: Lamp) -> Sequence[NDArray[np.float64]]:

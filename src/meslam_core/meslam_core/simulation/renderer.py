@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import open3d as o3d
@@ -81,8 +82,7 @@ class Renderer:
         Colour is filtered over each pixel's footprint and, where a pixel holds an edge, averaged
         over several rays; depth is that of the pixel's centre.
         """
-        directions = camera.pixel_directions().reshape(-1, 3)
-        hits = self._cast(directions, T_map_camera)
+        hits = self._cast(*_image_rays(camera), T_map_camera)
         color = self._shade(hits, camera)
         size = (camera.height, camera.width)
         seen = np.isfinite(hits.distance)
@@ -95,13 +95,16 @@ class Renderer:
                 (pixels[:, None] + EDGE_SAMPLES[:, axis]).ravel()
                 for axis, pixels in enumerate((columns, rows))
             )
-            extra = self._shade(self._cast(camera.ray_directions(u, v), T_map_camera), camera)
+            rays = _with_lengths(camera.ray_directions(u, v))
+            extra = self._shade(self._cast(*rays, T_map_camera), camera)
             mean = extra.reshape(len(rows), len(EDGE_SAMPLES), 3).mean(axis=1)
             color[rows * camera.width + columns] = mean
         return View(color.reshape(*size, 3), depth, hits.incidence.reshape(size))
 
-    def _cast(self, directions: NDArray[np.float32], T_map_camera: Pose) -> _Hits:
-        """Cast rays of camera-frame directions (N, 3) from the camera."""
+    def _cast(
+        self, directions: NDArray[np.float32], lengths: NDArray[np.float32], T_map_camera: Pose
+    ) -> _Hits:
+        """Cast rays of camera-frame directions (N, 3) and their lengths (N,) from the camera."""
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3] = T_map_camera[:3, 3]
         turned = directions @ T_map_camera[:3, :3].T.astype(np.float32)
@@ -109,7 +112,7 @@ class Renderer:
         answer = self._caster.cast_rays(o3d.core.Tensor.from_numpy(rays))
         normals = answer["primitive_normals"].numpy()
         cosine = np.abs(np.einsum("ij,ij->i", normals, turned))
-        cosine /= np.sqrt(np.einsum("ij,ij->i", directions, directions))
+        cosine /= lengths
         return _Hits(
             distance=answer["t_hit"].numpy(),
             triangle=answer["primitive_ids"].numpy(),
@@ -135,6 +138,18 @@ class Renderer:
             footprint = np.where(seen, distance, 1) / texel_px
             color[block] = np.where(seen[:, None], self._atlas.lookup(x, y, footprint), 0)
         return color
+
+
+@lru_cache(maxsize=2)
+def _image_rays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Directions (N, 3) of all pixels row by row, and their lengths (N,)."""
+    return _with_lengths(camera.pixel_directions().reshape(-1, 3))
+
+
+def _with_lengths(
+    directions: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    return directions, np.sqrt(np.einsum("ij,ij->i", directions, directions))
 
 
 def scene_surface(scene: Scene) -> o3d.geometry.TriangleMesh:

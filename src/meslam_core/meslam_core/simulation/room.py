@@ -76,7 +76,9 @@ def _wall_decoration() -> list[Patch]:
         CHAMBER.wall("west").hung(3.20, 2.10, 0.60, 0.80, poster, 0.002, gap=0.012),
         CHAMBER.wall("south").hung(0.45, 2.10, 0.60, 0.42, poster, 0.002, gap=0.012),
         CHAMBER.wall("south").hung(0.50, 1.55, 0.42, 0.60, poster, 0.002, gap=0.012),
-        CHAMBER.wall("south").hung(1.70, 2.15, 1.60, 1.15, textures.window_view(), 0.003, gap=0.012),
+        CHAMBER.wall("south").hung(
+            1.70, 2.15, 1.60, 1.15, textures.window_view(), 0.003, gap=0.012
+        ),
     ]
     curtain = textures.fabric((0.66, 0.28, 0.24), (0.82, 0.62, 0.36))
     for x in (1.45, 3.55):

@@ -85,13 +85,17 @@ class D435:
         self, view: View, rng: np.random.Generator, exposure: float = 1.0
     ) -> NDArray[np.uint8]:
         """Colour image (H, W, 3) uint8: slightly soft, with noise that grows with the signal."""
-        soft = np.asarray(cv2.GaussianBlur(view.color, (0, 0), 0.55)) * np.float32(exposure)
-        strength = np.sqrt(soft * np.float32(1 / 128) + np.float32(0.15))
+        soft = np.asarray(cv2.GaussianBlur(view.color, (0, 0), 0.55))
+        soft *= np.float32(exposure)
+        strength = soft * np.float32(1 / 128)
+        strength += np.float32(0.15)
+        np.sqrt(strength, out=strength)
         grain = rng.standard_normal(soft.shape, np.float32)
         grain *= strength
         grain *= np.float32(self.color_noise)
         grain += soft
-        return np.asarray(np.clip(np.rint(grain), 0, 255), np.uint8)
+        np.rint(grain, out=grain)
+        return np.clip(grain, 0, 255, out=grain).astype(np.uint8)
 
     def exposure(self, time_s: float, seed: int) -> float:
         """Relative exposure at a time: automatic exposure wanders slowly."""

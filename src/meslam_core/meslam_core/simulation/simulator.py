@@ -79,10 +79,11 @@ class Simulation:
         return len(self.truth)
 
     def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[RgbdFrame]:
-        """Render the frames `start:stop:step` in order, two at a time."""
+        """Render the frames `start:stop:step` in order, two at a time and two ahead."""
         indices = iter(range(len(self))[start:stop:step])
         with ThreadPoolExecutor(RENDER_THREADS) as pool:
-            pending = deque(pool.submit(self.frame, i) for i in islice(indices, RENDER_THREADS))
+            ahead = islice(indices, 2 * RENDER_THREADS)
+            pending = deque(pool.submit(self.frame, i) for i in ahead)
             while pending:
                 frame = pending.popleft().result()
                 pending.extend(pool.submit(self.frame, i) for i in islice(indices, 1))

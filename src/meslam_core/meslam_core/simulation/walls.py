@@ -68,7 +68,9 @@ class Wall:
         """A rectangle `left` m from the left edge, its upper edge `top` m above the floor."""
         right_x, right_y = self.right
         corner = self.point(left, top, gap)
-        return quad(corner, (width * right_x, width * right_y, 0), (0, 0, -height), texture, texel_m)
+        return quad(
+            corner, (width * right_x, width * right_y, 0), (0, 0, -height), texture, texel_m
+        )
 
     def face(self, texture: Texture, texel_m: float, openings: Sequence[Opening] = ()) -> Patch:
         """The whole wall as one patch without the openings."""
@@ -148,9 +150,7 @@ class Chamber:
         }[side]
         return Wall(corner, right, extent, self.height_m)
 
-    def against(
-        self, side: str, along: float, depth: float
-    ) -> tuple[tuple[float, float], float]:
+    def against(self, side: str, along: float, depth: float) -> tuple[tuple[float, float], float]:
         """Position and yaw of furniture `depth` m deep with its back to a wall."""
         wall = self.wall(side)
         x, y, _ = wall.point(along, 0.0, depth / 2 + 0.03)

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from meslam_core.config import MeslamConfig
+from meslam_core.continuation import Continuation
 from meslam_core.field import field_device, make_field
 from meslam_core.frame import RgbdFrame
 from meslam_core.frame_result import FrameResult, TrackingState
@@ -93,6 +94,11 @@ class Slam:
         frames_wait: whether frames wait to be tracked. While they do, mapping gives way: it ends
             after `mapping.min_iterations` steps. A live system asks its queue; by default nothing
             waits, and every frame gets all its steps.
+        continuation: a stored map to go on with, instead of an empty one; it tells where the
+            first frame is.
+
+    Raises:
+        MapError: when the map cannot be continued.
     """
 
     def __init__(
@@ -101,7 +107,11 @@ class Slam:
         seed: int = 0,
         T_map_camera: Pose = T_BODY_OPTICAL,
         frames_wait: Callable[[], bool] = lambda: False,
+        continuation: Continuation | None = None,
     ) -> None:
+        if continuation is not None:
+            config = continuation.adapted(config)
+            T_map_camera = continuation.T_map_camera
         self.config = config
         self.device = field_device(config.field)
         kept = config.keyframes
@@ -111,7 +121,7 @@ class Slam:
         self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed, rays_rest)
         self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
         self.policy = KeyframePolicy(config.keyframes, config.field)
-        self.tracking = FrameTracking(config.tracking)
+        self.tracking = FrameTracking(config.tracking, T_map_camera)
         self._history = self.tracking.history
         self.atlas: RegionAtlas | None = None
         self._frames_wait = frames_wait
@@ -133,6 +143,12 @@ class Slam:
         # What tracking sees of the working region while training changes the original.
         self._view: Region | None = None
         self._viewed_field = make_field(config.field, seed)
+        # Keyframes that stand for an earlier session's.
+        self.remembered = 0
+        if continuation is not None:
+            self.atlas = continuation.atlas(config, self.keyframes, seed, self._scratch)
+            self.remembered = len(self.keyframes)
+            self._look()
 
     @property
     def state(self) -> TrackingState:
@@ -238,7 +254,7 @@ class Slam:
                 falls with it, and with it the noise that training leaves in the map.
         """
         self._finish_training()
-        if self.atlas is None:
+        if self.atlas is None or not self._touched:
             return
         rate_factor = 1.0 + progress * (LAST_RATE_FACTOR - 1.0)
         while steps > 0:
@@ -252,8 +268,14 @@ class Slam:
     @property
     def refining_steps(self) -> int:
         """How many steps a refinement of the whole map takes."""
-        regions = len(self.atlas.regions) if self.atlas else 0
+        regions = len(self._touched) if self.atlas else 0
         return self.config.mapping.final_iterations * max(regions, 1)
+
+    @property
+    def _touched(self) -> list[Region]:
+        """The regions of this session: all but those that an earlier one left, unchanged."""
+        assert self.atlas is not None
+        return [region for region in self.atlas.regions.values() if not region.untouched]
 
     def _next_to_refine(self, most: int) -> tuple[Region, int]:
         """The region whose turn it is, and at most so many steps of those that it gets.
@@ -262,7 +284,7 @@ class Slam:
         it costs as much as some of them.
         """
         assert self.atlas is not None
-        regions = list(self.atlas.regions.values())
+        regions = self._touched
         if self._refined.left <= 0:
             self._refined.region = (self._refined.region + 1) % len(regions)
             mean = sum(len(each.keyframes) for each in regions) / len(regions)
@@ -285,7 +307,7 @@ class Slam:
         self._finish_training()
         if self.atlas is None:
             return
-        for region in self.atlas.regions.values():
+        for region in self._touched:
             with self.atlas.awake(region):
                 region.version += self.atlas.rebuild_mask(region)
         self._look()
@@ -379,7 +401,7 @@ class Slam:
                 self.keyframes.add_link(link.first, link.second, link.T_first_second)
             if self.recogniser is not None:
                 corrections = self.recogniser.corrections
-                for region in self.atlas.doubtful:
+                for region in self.atlas.doubtful[:1]:
                     self.recogniser.ask(region, *linked)
                 if self.recogniser.corrections > corrections:
                     pose = self.keyframes.pose(linked[0])

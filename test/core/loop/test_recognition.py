@@ -8,7 +8,7 @@ import torch
 from data.textured_room import CAMERA, frame_at, path
 
 from meslam_core.config import MeslamConfig
-from meslam_core.loop.recognition import MOST_DOUBTS, RegionRecogniser
+from meslam_core.loop.recognition import MANY_DOUBTS, THEN_EVERY, RegionRecogniser
 from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.keyframes import KeyframeStore, rays_at
 from meslam_core.regions.atlas import RegionAtlas
@@ -58,14 +58,14 @@ def returned() -> tuple[Walk, tuple]:
         walk.add(pose, exp(share * log(DRIFT)) @ pose)
     back = POSES[3] @ exp(np.array([0.03, 0.02, 0.0, 0.0, 0.02, 0.0]))
     latest = walk.add(back, DRIFT @ back)
-    walk.atlas.working.confirmed = False
+    walk.atlas.working.confirmed, walk.atlas.working.known_until = False, len(POSES)
     return walk, (latest, back)
 
 
 def test_the_path_is_corrected_by_what_a_region_recognises(returned):
     walk, (latest, back) = returned
     region, before = walk.atlas.working, walk.keyframes.pose(10)
-    beside = inverse(walk.keyframes.pose(4)) @ region.T_map_region
+    beside = inverse(walk.keyframes.pose(1)) @ region.T_map_region
     weights = region.weights()
     walk.recogniser.ask(region, *latest)
     assert region.confirmed
@@ -75,7 +75,7 @@ def test_the_path_is_corrected_by_what_a_region_recognises(returned):
     assert np.linalg.norm(found[3:]) < 0.01
     assert not np.allclose(walk.keyframes.pose(10), before, atol=1e-3)
     # The region goes with its keyframes, and no network is trained for it.
-    kept = inverse(walk.keyframes.pose(4)) @ region.T_map_region
+    kept = inverse(walk.keyframes.pose(1)) @ region.T_map_region
     np.testing.assert_allclose(kept, beside, atol=0.02)
     np.testing.assert_array_equal(region.weights(), weights)
 
@@ -86,25 +86,33 @@ def test_a_region_that_lies_where_it_is_believed_is_confirmed_and_nothing_moves(
         walk.atlas.add_keyframe(walk.add(pose, pose)[0])
     latest = walk.add(POSES[2], POSES[2])
     poses = walk.keyframes.poses()
-    walk.atlas.working.confirmed = False
+    walk.atlas.working.confirmed, walk.atlas.working.known_until = False, len(POSES)
     walk.recogniser.ask(walk.atlas.working, *latest)
     assert walk.atlas.working.confirmed
     assert walk.recogniser.corrections == 0
     np.testing.assert_array_equal(walk.keyframes.poses(), poses)
 
 
-def test_a_view_that_a_region_does_not_know_moves_nothing_and_is_waited_for_only_so_long():
-    walk = Walk()
+def test_a_view_that_a_region_does_not_know_moves_nothing_and_is_asked_about_less_and_less(
+    monkeypatch,
+):
+    walk, asked = Walk(), []
     for pose in POSES:
         walk.atlas.add_keyframe(walk.add(pose, pose)[0])
     region = walk.atlas.working
-    region.confirmed = False
+    region.confirmed, region.known_until = False, len(POSES)
     away = POSES[0] @ exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(100.0), 0.0]))
-    for number in range(MOST_DOUBTS):
-        assert not region.confirmed
-        # Believed to see what the region's keyframes saw.
-        latest = walk.add(away, POSES[2], linked=False)
+    # Believed to see what the region's keyframes saw.
+    latest = walk.add(away, POSES[2], linked=False)
+    recognise = walk.linker.recognise
+
+    def counted(*arguments):
+        asked.append(region.doubts)
+        return recognise(*arguments)
+
+    monkeypatch.setattr(walk.linker, "recognise", counted)
+    for _ in range(MANY_DOUBTS + THEN_EVERY):
         walk.recogniser.ask(region, *latest)
-        assert region.doubts == number + 1
-    assert region.confirmed
+    assert not region.confirmed
     assert walk.recogniser.corrections == 0
+    assert asked == [*range(1, MANY_DOUBTS + 1), MANY_DOUBTS + THEN_EVERY]

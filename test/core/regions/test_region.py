@@ -24,7 +24,7 @@ def room(build_room, request):
 def test_a_region_at_rest_is_on_disk_alone_and_still_answers_for_itself(room):
     region, scratch = room.region, ScratchFile()
     weights, flags = region.weights(), region.observed().flags.copy()
-    region.rest(scratch)
+    region.rest(scratch, 5)
     assert region.at_rest
     for what in ("field", "mask"):
         with pytest.raises(AssertionError, match="at rest"):
@@ -39,7 +39,7 @@ def test_a_region_at_rest_is_on_disk_alone_and_still_answers_for_itself(room):
 def test_training_goes_on_after_a_rest_as_if_there_had_been_none(build_room, room):
     overrides = (f"field.backend={room.config.field.backend}", "keyframes.rays=1024")
     rested, other = room, build_room(20, overrides)
-    rested.region.rest(ScratchFile())
+    rested.region.rest(ScratchFile(), 5)
     rested.region.wake()
     for each in (rested, other):
         optimizer = JointOptimizer(each.keyframes, each.config.mapping, seed=1)
@@ -51,11 +51,11 @@ def test_training_goes_on_after_a_rest_as_if_there_had_been_none(build_room, roo
 
 def test_resting_again_and_again_takes_no_more_disk(room):
     region, scratch = room.region, ScratchFile()
-    region.rest(scratch)
+    region.rest(scratch, 5)
     size = scratch.size
     for _ in range(3):
         region.wake()
-        region.rest(scratch)
+        region.rest(scratch, 5)
     assert scratch.size == size
 
 
@@ -68,6 +68,6 @@ def test_a_region_that_the_disk_does_not_take_stays_awake(room, monkeypatch):
 
     monkeypatch.setattr(os, "pwrite", full)
     with pytest.raises(OutputError, match="No space left"):
-        region.rest(scratch)
+        region.rest(scratch, 5)
     assert not region.at_rest
     np.testing.assert_array_equal(region.field.flat(), weights)

@@ -20,14 +20,16 @@ log = logging.getLogger(__name__)
 # is corrected; smaller differences training and links even out.
 TOLERATED_M = 0.02
 TOLERATED_RAD = 0.01
-# After so many keyframes that told nothing a region is believed to lie right.
-MOST_DOUBTS = 8
+# After so many keyframes that told nothing only every so many are asked.
+MANY_DOUBTS = 8
+THEN_EVERY = 4
 
 
 class RegionRecogniser:
     """Asks regions that woke whether they know the view, and corrects the path by the answer.
 
-    Until then such a region is not trained: what does not agree with its map would spoil it.
+    Until then such a region is not trained, what does not agree with its map would spoil it, and
+    the region before goes on working as long as it contains the camera.
 
     Args:
         atlas: its regions are moved by corrections.
@@ -52,14 +54,13 @@ class RegionRecogniser:
             frame: its images.
             rays: its sample, camera frame.
         """
-        known = [each for each in region.keyframes if each != keyframe]
-        links = self._linker.recognise(keyframe, frame, rays, known)
         region.doubts += 1
+        if region.doubts > MANY_DOUBTS and region.doubts % THEN_EVERY:
+            return
+        links = self._linker.recognise(keyframe, frame, rays, range(region.known_until))
         if links:
             self._believe(links)
-        region.confirmed = bool(links) or region.doubts >= MOST_DOUBTS
-        if region.confirmed and not links:
-            log.warning("region %s was not recognised; its map is believed", region.index)
+            region.confirmed = True
 
     def _believe(self, links: list[CovisibilityLink]) -> None:
         keyframes = self._keyframes

@@ -108,7 +108,8 @@ class CovisibilityLinker:
         Returns:
             Links that agree with each other; none where the place is not recognised for certain.
         """
-        overlaps = self._overlaps(keyframe, frame.camera, rays, np.array(among, np.int64))
+        known = np.intersect1d(np.array(among, np.int64), self._images.numbers)
+        overlaps = self._overlaps(keyframe, frame.camera, rays, known)
         prepared = self._registrar.prepare(KeyframeImage.of(frame, self._width).frame())
         links: list[CovisibilityLink] = []
         shared = [k for k, overlap in overlaps if overlap > MIN_RECOGNISED_OVERLAP]

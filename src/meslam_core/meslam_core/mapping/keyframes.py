@@ -52,6 +52,7 @@ class KeyframeStore:
     Attributes:
         links: measured motions between keyframes.
         stamps_ns: of the keyframes' images.
+        fixed: the first so many keyframes keep their poses; they hold the map in its frame.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class KeyframeStore:
         self.device = device
         self.links = KeyframeLinks()
         self.stamps_ns: list[int] = []
+        self.fixed = 1
         self.storage = RayStorage(rays_per_keyframe, device, ray_budget, seed, scratch)
         self._lock = threading.Lock()
         self._rotations = np.zeros((0, 3, 3), np.float32)

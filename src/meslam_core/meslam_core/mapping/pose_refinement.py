@@ -98,7 +98,7 @@ class PoseBlock:
             self._links.add_gradient(
                 self.rotations, self.translations, config.odometry_weight, gradient
             )
-        gradient[self._numbers == 0] = 0.0
+        gradient[self._numbers < self._refinement.keyframes.fixed] = 0.0
         beta1, beta2 = ADAM_BETAS
         self._refinement.steps += 1
         n = self._refinement.steps
@@ -118,7 +118,7 @@ class PoseBlock:
 
     def finish(self) -> None:
         """Put the poses back into the store, their rotations made orthonormal again."""
-        moving = np.flatnonzero(self._numbers != 0)
+        moving = np.flatnonzero(self._numbers >= self._refinement.keyframes.fixed)
         numbers = self._numbers[moving]
         self._refinement.first_moment[numbers] = self._first[moving]
         self._refinement.second_moment[numbers] = self._second[moving]

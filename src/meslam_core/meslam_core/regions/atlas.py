@@ -76,6 +76,15 @@ class RegionAtlas:
         T_map_region[:3, 3] = self.grid.center(self._working)
         self.regions[self._working] = self._new_region(self._working, T_map_region)
 
+    def take_over(
+        self, grid: RegionGrid, regions: Iterable[Region], position: NDArray[np.floating]
+    ) -> None:
+        """Go on with regions of an earlier session; the one nearest to `position` (3,) works."""
+        self.grid = grid
+        self.regions = {region.index: region for region in regions}
+        self._working = min(self.regions, key=lambda index: self._off_center(index, position))
+        self._wake(self.working)
+
     @property
     def working(self) -> Region:
         """The region that is optimised together with the pose."""
@@ -114,7 +123,6 @@ class RegionAtlas:
         self._near = [i for i in self._about(on_lattice) if self._off_center(i, position) < reach]
         for region in self.active:
             self._wake(region)
-        self.working.confirmed = True
         woken = tuple(i for i in self._training if i not in before and i not in created)
         return RegionChange(tuple(created), woken, changed)
 
@@ -191,7 +199,9 @@ class RegionAtlas:
             before, after: (K, 4, 4) T_map_camera of all keyframes.
         """
         for region in self.regions.values():
-            motion = rigid_motion(before[region.keyframes], after[region.keyframes])
+            # A map is where its first keyframes are; what came later may have been elsewhere.
+            first = region.keyframes[: (len(region.keyframes) + 1) // 2]
+            motion = rigid_motion(before[first], after[first])
             region.T_map_region = orthonormalized(motion @ region.T_map_region)
             region.version += 1
 
@@ -227,7 +237,8 @@ class RegionAtlas:
     def rebuild_mask(self, region: Region) -> bool:
         """Mark the observed space anew from the refined keyframe poses; whether it changed."""
         before = region.mask.flags.copy()
-        region.mask.clear()
+        if region.origin is None:
+            region.mask.clear()
         for keyframe in region.keyframes:
             self.observe(region, keyframe)
         region.unmarked.clear()
@@ -311,4 +322,4 @@ class RegionAtlas:
             return
         for region in self.regions.values():
             if not any(region is each for each in kept):
-                region.rest(self._scratch)
+                region.rest(self._scratch, len(self.keyframes))

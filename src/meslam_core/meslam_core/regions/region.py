@@ -31,6 +31,19 @@ class _Rest:
     mask_voxel_m: float
 
 
+@dataclass(frozen=True)
+class RegionOrigin:
+    """What an earlier session stored of a region.
+
+    Attributes:
+        version: of the region then.
+        data: the bytes it is stored as.
+    """
+
+    version: int
+    data: bytes
+
+
 class Region:
     """One network and the space assigned to it.
 
@@ -50,7 +63,9 @@ class Region:
         unmarked: keyframes whose views the mask does not show yet.
         confirmed: whether the camera is known to be where this region's map has it; after a rest
             the path may have drifted.
+        known_until: keyframes below this number are from before that rest.
         doubts: keyframes since it woke that did not tell.
+        origin: what it was when this session began, where it is from an earlier one.
     """
 
     def __init__(
@@ -71,11 +86,18 @@ class Region:
         self.seen = 0
         self.unmarked: list[int] = []
         self.confirmed = True
+        self.known_until = 0
         self.doubts = 0
+        self.origin: RegionOrigin | None = None
         self.field_config: FieldConfig = field.config
         self._field: FieldModel | None = field
         self._mask: ObservedMask | None = mask
         self._rest: _Rest | None = None
+
+    @property
+    def untouched(self) -> bool:
+        """Whether it is still as an earlier session stored it."""
+        return self.origin is not None and self.origin.version == self.version
 
     @property
     def at_rest(self) -> bool:
@@ -120,8 +142,12 @@ class Region:
             self.index, self.T_map_region, self.side_m, field, mask, self.keyframes, self.version
         )
 
-    def rest(self, scratch: ScratchFile) -> None:
+    def rest(self, scratch: ScratchFile, keyframes: int = 0) -> None:
         """Leave memory.
+
+        Args:
+            scratch: where to.
+            keyframes: how many there are so far.
 
         Raises:
             OutputError: when the disk does not take it; the region then stays awake.
@@ -140,6 +166,7 @@ class Region:
         )
         self._rest = _Rest(scratch, record, self.mask.flags.shape[0], self.mask.voxel_m)
         self._field = self._mask = None
+        self.known_until = keyframes if self.confirmed else self.known_until
         self.confirmed, self.doubts = False, 0
 
     def wake(self) -> None:

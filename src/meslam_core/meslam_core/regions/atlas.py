@@ -315,7 +315,9 @@ class RegionAtlas:
 
     def _wake(self, region: Region) -> None:
         region.wake()
-        region.confirmed = region.confirmed or not self._recognises
+        # Without images of before there is nothing to be recognised by.
+        known = self._recognises and region.known_until > 0
+        region.confirmed = region.confirmed or not known
 
     def _rest_except(self, kept: list[Region]) -> None:
         if self._scratch is None:

@@ -267,9 +267,13 @@ class Slam:
 
     @property
     def refining_steps(self) -> int:
-        """How many steps a refinement of the whole map takes."""
+        """How many steps a refinement of the whole map takes.
+
+        More than of a single region, but not in proportion: each of many was shorter in view, and
+        its neighbours refine the same keyframes.
+        """
         regions = len(self._touched) if self.atlas else 0
-        return self.config.mapping.final_iterations * max(regions, 1)
+        return round(self.config.mapping.final_iterations * max(regions, 1) ** 0.5)
 
     @property
     def _touched(self) -> list[Region]:

@@ -6,7 +6,10 @@ import fcntl
 import json
 import os
 import random
+import resource
+import shutil
 import signal
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -192,43 +195,187 @@ def test_a_failed_first_save_leaves_nothing_behind(
     assert number > 8
 
 
-def test_killed_at_random_instants_while_saving(
-    saved: MapStore, two_small_regions: Regions
-) -> None:
-    """A child saves two maps in turn and is killed; what is there is always one of them."""
-    maps = [
+@contextlib.contextmanager
+def child(work: Callable[[], None]) -> Iterator[int]:
+    """A process of its own that works until it is killed, at the latest on leaving."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of forking with threads
+        process = os.fork()
+    if process == 0:
+        try:
+            work()
+        finally:
+            os._exit(1)
+    try:
+        yield process
+    finally:
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+
+
+def status_of(work: Callable[[], None]) -> int:
+    """With what a process of its own ends, or the signal that ended it."""
+    with child(work) as process:
+        return os.waitid(os.P_PID, process, os.WEXITED | os.WNOWAIT).si_status
+
+
+def contents(store: MapStore) -> set[bytes]:
+    """The encoded regions of an undamaged map."""
+    loaded = store.load()
+    assert not loaded.warnings
+    return set(loaded.encoded.values())
+
+
+@pytest.fixture
+def two_maps(two_small_regions: Regions) -> list[list[bytes]]:
+    """Two maps of the same places with nothing in common."""
+    return [
         [codec.encode(region) for region in regions]
         for regions in (two_small_regions, [changed(region) for region in two_small_regions])
     ]
-    old, new = {(0, 0, 0): 4, (1, 0, 0): 4}, {(0, 0, 0): 5, (1, 0, 0): 5}
+
+
+def test_killed_at_random_instants_while_saving(
+    saved: MapStore, two_maps: list[list[bytes]]
+) -> None:
+    """A child saves two maps in turn and is killed; what is there is always one of them."""
+
+    def save_for_ever() -> None:
+        while True:
+            for regions in reversed(two_maps):
+                MapStore(saved.path).save(regions, GRID)
+
     generator = random.Random(1)
-    seen = []
+    seen, halfway = [], 0
     for _ in range(50):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of forking with threads
-            child = os.fork()
-        if child == 0:
-            while True:
-                for regions in maps:
-                    MapStore(saved.path).save(regions, GRID)
-        time.sleep(generator.uniform(0.0, 0.03))
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        seen.append(versions(saved))
-    assert all(found in (old, new) for found in seen)
-    saved.save(maps[0], GRID)
+        with child(save_for_ever):
+            time.sleep(generator.uniform(0.0, 0.03))
+        halfway += len(os.listdir(saved.path)) != 3
+        seen.append(contents(saved))
+    assert all(found in (set(two_maps[0]), set(two_maps[1])) for found in seen)
+    assert halfway > 5, "hardly any kill came in the middle of a save"
+    saved.save(two_maps[0], GRID)
     assert len(list(saved.path.iterdir())) == 3
 
 
+def test_killed_at_every_step_of_a_save(
+    saved: MapStore, two_maps: list[list[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As above, with the kill before each call that changes the disk, one after the other."""
+    found = []
+    for number in range(1, 100):
+        saved.save(two_maps[0], GRID)
+
+        def save_and_die(number: int = number) -> None:
+            calls = iter(range(1, 1000))
+
+            def fatal(original: Callable[..., Any]) -> Callable[..., Any]:
+                def call(*arguments: Any, **named: Any) -> Any:
+                    if next(calls) == number:
+                        os.kill(os.getpid(), signal.SIGKILL)
+                    return original(*arguments, **named)
+
+                return call
+
+            for name in ("fsync", "replace", "unlink"):
+                monkeypatch.setattr(os, name, fatal(getattr(os, name)))
+            MapStore(saved.path).save(two_maps[1], GRID)
+            os._exit(0)
+
+        status = status_of(save_and_die)
+        found.append([set(regions) for regions in two_maps].index(contents(saved)))
+        if status == 0:
+            break
+    assert len(found) > 10
+    assert found == sorted(found), "the new map was there, and then not"
+    assert {found[0], found[-1]} == {0, 1}
+
+
+def test_reading_while_another_process_saves(saved: MapStore, two_maps: list[list[bytes]]) -> None:
+    def save_for_ever() -> None:
+        while True:
+            for regions in reversed(two_maps):
+                MapStore(saved.path).save(regions, GRID)
+                time.sleep(0.002)
+
+    with child(save_for_ever):
+        found = [contents(saved) for _ in range(150)]
+    assert all(each in (set(two_maps[0]), set(two_maps[1])) for each in found)
+    assert len({frozenset(each) for each in found}) == 2
+
+
+def test_a_full_disk_leaves_the_old_map(saved: MapStore, two_maps: list[list[bytes]]) -> None:
+    """The limit on a file's size stands for the disk's end: writing fails half-way."""
+
+    def save_on_a_full_disk() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))
+        try:
+            MapStore(saved.path).save(two_maps[1], GRID)
+        except OutputError as error:
+            os._exit(7 if "cannot be written" in str(error) else 8)
+
+    assert status_of(save_on_a_full_disk) == 7
+    assert contents(saved) == set(two_maps[0])
+    assert len(os.listdir(saved.path)) == 3
+    saved.save(two_maps[1], GRID)
+    assert contents(saved) == set(two_maps[1])
+
+
+def test_a_folder_without_permission(two_maps: list[list[bytes]]) -> None:
+    def save_as_somebody_else() -> None:
+        if os.getuid() == 0:
+            os.setuid(65534)
+        try:
+            MapStore(path).save(two_maps[1], GRID)
+        except OutputError as error:
+            os._exit(7 if str(path) in str(error) else 8)
+
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o755)
+        path = Path(folder, "flat.meslam")
+        MapStore(path).save(two_maps[0], GRID)
+        os.chmod(path, 0o555)
+        assert status_of(save_as_somebody_else) == 7
+        assert contents(MapStore(path)) == set(two_maps[0])
+        os.chmod(path, 0o755)
+
+
+def test_a_vanished_folder_is_made_again(saved: MapStore, two_small_regions: Regions) -> None:
+    shutil.rmtree(saved.path.parent)
+    saved.save(two_small_regions, GRID)
+    assert versions(saved) == {(0, 0, 0): 4, (1, 0, 0): 4}
+
+
 def test_a_changed_byte_in_a_region_is_named_and_the_rest_loads(saved: MapStore) -> None:
-    damaged = region_files(saved)[1]
-    data = damaged.read_bytes()
-    for position in range(0, len(data), 7):
-        damaged.write_bytes(data[:position] + bytes([data[position] ^ 0x10]) + data[position + 1 :])
-        loaded = saved.load()
-        assert [region.index for region in loaded.regions] == [(0, 0, 0)]
-        assert len(loaded.warnings) == 1
-        assert damaged.name in loaded.warnings[0]
+    for damaged, other in zip(region_files(saved), ((1, 0, 0), (0, 0, 0)), strict=True):
+        data = damaged.read_bytes()
+        for position in [*range(64), *range(64, len(data), 7)]:
+            flipped = data[position] ^ (1 << position % 8)
+            damaged.write_bytes(data[:position] + bytes([flipped]) + data[position + 1 :])
+            loaded = saved.load()
+            assert [region.index for region in loaded.regions] == [other]
+            assert len(loaded.warnings) == 1
+            assert damaged.name in loaded.warnings[0]
+        damaged.write_bytes(data)
+    assert versions(saved) == {(0, 0, 0): 4, (1, 0, 0): 4}
+
+
+def test_a_changed_byte_in_any_file_of_a_large_map_is_named(
+    tmp_path: Path, region: StoredRegion, neighbour: StoredRegion
+) -> None:
+    store = MapStore(tmp_path / "room.meslam")
+    store.save([region, neighbour], GRID)
+    generator = random.Random(2)
+    for damaged in sorted(store.path.iterdir()):
+        data = damaged.read_bytes()
+        for position in (0, len(data) - 1, *generator.sample(range(len(data)), 8)):
+            flipped = data[position] ^ (1 << generator.randrange(8))
+            damaged.write_bytes(data[:position] + bytes([flipped]) + data[position + 1 :])
+            loaded = store.load()
+            assert damaged.name in loaded.warnings[0]
+            assert len(loaded.regions) == (2 if damaged.name == "manifest.json" else 1)
+        damaged.write_bytes(data)
 
 
 def test_a_missing_region_is_named_and_the_rest_loads(saved: MapStore) -> None:

@@ -171,7 +171,7 @@ class Scripted:
     def prepare(self, frame: RgbdFrame) -> RgbdFrame:
         return frame
 
-    def register(self, source, target, T_target_source, *, wide=False) -> Registration:
+    def register(self, source, target, T_target_source) -> Registration:
         pose = T_target_source @ self._found["T_target_source"]
         fitness, agreement = self._found["fitness"], self._found["agreement"]
         return Registration(pose, np.eye(6), fitness, 0.001, agreement)
@@ -180,7 +180,7 @@ class Scripted:
 class Failing(Scripted):
     """A registrar that never finds anything."""
 
-    def register(self, source, target, T_target_source, *, wide=False) -> Registration:
+    def register(self, source, target, T_target_source) -> Registration:
         raise RuntimeError("singular")
 
 

@@ -67,9 +67,10 @@ def errors(found: Pose, true: Pose) -> tuple[float, float]:
     return float(np.linalg.norm(twist[:3])), float(np.rad2deg(np.linalg.norm(twist[3:])))
 
 
-def register(source: RgbdFrame, target: RgbdFrame, wide: bool = False):
+def register(source: RgbdFrame, target: RgbdFrame, search: bool = False):
     used = registrar()
-    return used.register(used.prepare(source), used.prepare(target), np.eye(4), wide=wide)
+    prepared, start = (used.prepare(source), used.prepare(target)), np.eye(4)
+    return used.register(*prepared, used.search(*prepared, start) if search else start)
 
 
 def pyramid(**changed):
@@ -113,10 +114,10 @@ def test_scattered_holes_leave_the_motion(source, target):
 
 
 @pytest.mark.parametrize("axis", [3, 4], ids=["pitch", "yaw"])
-def test_the_wide_search_finds_a_turn_beyond_the_narrow_one(target, axis):
+def test_the_search_finds_a_turn_beyond_the_reach_of_registration(target, axis):
     turn = exp(np.deg2rad(12.0) * np.eye(6)[axis])
     turned = frame_at(START @ turn, 1, LARGE)
-    narrow, wide = register(turned, target), register(turned, target, wide=True)
+    narrow, wide = register(turned, target), register(turned, target, search=True)
     distance, angle = errors(wide.T_target_source, turn)
     assert distance < 0.003
     assert angle < 0.1

@@ -30,8 +30,8 @@ ATTEMPTS_A_LINK = 2
 MIN_FITNESS = 0.6
 MIN_AGREEMENT = 0.3
 # A registration farther from where the keyframes are believed to be is not believed itself.
-MAX_CORRECTION_M = 0.15
-MAX_CORRECTION_RAD = 0.12
+MAX_CORRECTION_M = 0.3
+MAX_CORRECTION_RAD = 0.25
 # A place is recognised when so many older keyframes say the same of where the camera is; these
 # share at least this much of the view, as far as the believed pose tells.
 RECOGNISING = 2

@@ -32,7 +32,6 @@ ITERATIONS = 10
 # From a bad guess the search runs on images of 20x15 and 40x30 pixels.
 SEARCH_LEVELS = 5
 SEARCH_FINEST = 3
-SEARCH_ITERATIONS = 10
 SEARCHED_TURNS = [
     exp(np.array([0.0, 0.0, 0.0, np.deg2rad(pitch), np.deg2rad(yaw), 0.0]))
     for yaw in (0.0, -8.0, 8.0, -16.0, 16.0)
@@ -97,38 +96,17 @@ class DirectRegistrar:
         )
         return DirectFrame(pyramid, gray, frame)
 
+    def register(
+        self, source: DirectFrame, target: DirectFrame, T_target_source: Pose
+    ) -> Registration:
+        return _registration(self._align(source, target, T_target_source))
+
     def propose(self, source: DirectFrame, target: DirectFrame) -> Iterator[Pose]:
         motion = propose_motion(source.features, target.features)
         if motion is not None:
             yield motion
 
-    def register(
-        self,
-        source: DirectFrame,
-        target: DirectFrame,
-        T_target_source: Pose,
-        *,
-        wide: bool = False,
-    ) -> Registration:
-        if wide:
-            T_target_source = self._search(source, target, T_target_source)
-        found = self._align(source, target, T_target_source)
-        visible, inliers = found["visible"], found["inliers"]
-        fitness = agreement = 0.0
-        if visible >= MIN_VISIBLE:
-            # A D435 measures half of the pixels: holes say nothing about a pose.
-            fitness = inliers / visible * found["in_view"] / found["points"]
-            agreement = _agreement(found)
-        residual_m = np.sqrt(found["squared_distance"] / inliers) if inliers else float("inf")
-        return Registration(
-            T_target_source=found["T_target_source"],
-            information=found["information"],
-            fitness=fitness,
-            residual_m=residual_m,
-            agreement=agreement,
-        )
-
-    def _search(self, source: DirectFrame, target: DirectFrame, T_target_source: Pose) -> Pose:
+    def search(self, source: DirectFrame, target: DirectFrame, T_target_source: Pose) -> Pose:
         """The pose on coarse levels that agrees best, of turns to all sides of a guess.
 
         Fast motion of a camera is mostly turning.
@@ -142,7 +120,6 @@ class DirectRegistrar:
                 T_target_source @ turn,
                 finest=SEARCH_FINEST,
                 levels=SEARCH_LEVELS,
-                iterations=SEARCH_ITERATIONS,
                 max_distance_m=limit,
             )
             agreement = _agreement(found)
@@ -158,7 +135,6 @@ class DirectRegistrar:
         *,
         finest: int = 0,
         levels: int = LEVELS,
-        iterations: int = ITERATIONS,
         max_distance_m: float | None = None,
     ) -> dict[str, Any]:
         found: dict[str, Any] = _kernel.align_rgbd(
@@ -167,7 +143,7 @@ class DirectRegistrar:
             T_target_source,
             finest=finest,
             levels=levels,
-            iterations=iterations,
+            iterations=ITERATIONS,
             max_distance=max_distance_m or self._config.max_distance_m,
             convergence=CONVERGENCE,
             correlated=CORRELATED,
@@ -175,6 +151,23 @@ class DirectRegistrar:
             luma_bias_rad=np.deg2rad(self._config.luma_bias_deg),
         )
         return found
+
+
+def _registration(found: dict[str, Any]) -> Registration:
+    visible, inliers = found["visible"], found["inliers"]
+    fitness = agreement = 0.0
+    if visible >= MIN_VISIBLE:
+        # A D435 measures half of the pixels: holes say nothing about a pose.
+        fitness = inliers / visible * found["in_view"] / found["points"]
+        agreement = _agreement(found)
+    residual_m = np.sqrt(found["squared_distance"] / inliers) if inliers else float("inf")
+    return Registration(
+        T_target_source=found["T_target_source"],
+        information=found["information"],
+        fitness=fitness,
+        residual_m=residual_m,
+        agreement=agreement,
+    )
 
 
 def _agreement(found: dict[str, Any]) -> float:

@@ -26,6 +26,10 @@ UNKNOWN_VARIANCE = 1.0
 # Within such a motion between two frames the alignment finds the right answer from any guess.
 SAFE_MOTION_M = 0.04
 SAFE_TURN_RAD = 0.05
+# A registration that starts so near to where another one ended ends there, too. Wider limits
+# (2 cm) would miss better results along plain walls.
+SAME_MOTION_M = 0.006
+SAME_TURN_RAD = 0.006
 NANOSECONDS = 1e-9
 
 
@@ -86,27 +90,45 @@ class KeyframeOdometry:
 
     def _register(self, prepared: Any, guess: Pose, elapsed_s: float) -> tuple[Registration, str]:
         """Register against the keyframe, harder where that is doubtful; why it is invalid."""
-        best = self._attempt(prepared, self._keyframe, self._T_odom_keyframe, guess, wide=False)
-        if self._is_doubtful(best, guess):
-            for target, T_odom_target, start, wide in self._other_attempts(prepared, guess):
-                tried = self._attempt(prepared, target, T_odom_target, start, wide=wide)
-                best = max(best, tried, key=lambda result: result.agreement)
-                if best.fitness >= self._config.good_fitness and wide:
+        best = self._attempt(prepared, self._keyframe, self._T_odom_keyframe, guess)
+        if not self._fits(best) or self._is_fast(best, guess):
+            found = [best]
+            for target, T_odom_target, start, searched in self._other_starts(prepared, guess):
+                T_keyframe_start = inverse(self._T_odom_keyframe) @ start
+                if not any(self._leads_to(T_keyframe_start, result) for result in found):
+                    found.append(self._attempt(prepared, target, T_odom_target, start))
+                    best = max(found, key=lambda result: result.agreement)
+                if searched and self._fits(best):
                     break
         return best, self._objection(best, elapsed_s)
 
-    def _is_doubtful(self, result: Registration, guess: Pose) -> bool:
-        """Whether a result may be a wrong one nearby: it fits badly, or the motion is fast."""
-        if result.fitness < self._config.good_fitness:
-            return True
+    def _fits(self, result: Registration) -> bool:
+        limits = self._config
+        return result.fitness >= limits.good_fitness and result.agreement >= limits.min_agreement
+
+    def _leads_to(self, T_keyframe_start: Pose, result: Registration) -> bool:
+        """Whether a registration that starts there would only end where another one did."""
+        apart = inverse(T_keyframe_start) @ result.T_target_source
+        near = float(np.linalg.norm(apart[:3, 3])) < SAME_MOTION_M
+        return (
+            near
+            and rotation_angle(apart) < SAME_TURN_RAD
+            and result.fitness >= self._config.min_fitness
+        )
+
+    def _is_fast(self, result: Registration, guess: Pose) -> bool:
+        """Whether the motion is so fast that a result which fits may be a wrong one nearby."""
         T_odom_camera = self._T_odom_keyframe @ result.T_target_source
         return any(
             np.linalg.norm(motion[:3, 3]) > SAFE_MOTION_M or rotation_angle(motion) > SAFE_TURN_RAD
             for motion in (inverse(guess) @ T_odom_camera, inverse(self._T_odom_last) @ guess)
         )
 
-    def _other_attempts(self, prepared: Any, guess: Pose) -> Iterator[tuple[Any, Pose, Pose, bool]]:
-        """Target, its pose, first guess and width of further attempts, the most promising first."""
+    def _other_starts(self, prepared: Any, guess: Pose) -> Iterator[tuple[Any, Pose, Pose, bool]]:
+        """Target, its pose, T_odom_camera to start from, and whether that took a search.
+
+        The most promising come first.
+        """
         keyframe, previous = (
             (self._keyframe, self._T_odom_keyframe),
             (self._previous, self._T_odom_last),
@@ -114,19 +136,25 @@ class KeyframeOdometry:
         for target, T_odom_target in (keyframe, previous):
             for proposed in self._registrar.propose(prepared, target):
                 yield target, T_odom_target, T_odom_target @ proposed, False
-        yield *keyframe, guess, True
-        yield *previous, guess, True
-        yield *previous, self._T_odom_last, True
+        for (target, T_odom_target), around in (
+            (keyframe, guess),
+            (previous, guess),
+            (previous, self._T_odom_last),
+        ):
+            try:
+                found = self._registrar.search(prepared, target, inverse(T_odom_target) @ around)
+            except RuntimeError as error:
+                logger.debug("search failed: %s", error)
+                continue
+            yield target, T_odom_target, T_odom_target @ found, True
 
     def _attempt(
-        self, prepared: Any, target: Any, T_odom_target: Pose, guess: Pose, wide: bool
+        self, prepared: Any, target: Any, T_odom_target: Pose, guess: Pose
     ) -> Registration:
         """One registration, expressed against the keyframe; fitness 0 where it fails."""
         failed = Registration(np.eye(4), np.zeros((6, 6)), 0.0, float("inf"))
         try:
-            result = self._registrar.register(
-                prepared, target, inverse(T_odom_target) @ guess, wide=wide
-            )
+            result = self._registrar.register(prepared, target, inverse(T_odom_target) @ guess)
         except RuntimeError as error:
             logger.debug("registration failed: %s", error)
             return failed

@@ -57,19 +57,28 @@ class Registrar(Protocol):
         """What registration needs of a frame."""
         ...
 
-    def propose(self, source: Any, target: Any) -> Iterator[Pose]:
-        """First guesses of T_target_source (4, 4) from the images alone, the best one first."""
-        ...
-
-    def register(
-        self, source: Any, target: Any, T_target_source: Pose, *, wide: bool = False
-    ) -> Registration:
+    def register(self, source: Any, target: Any, T_target_source: Pose) -> Registration:
         """Register two prepared frames from a first guess.
 
         Args:
             source, target: what `prepare` returned.
             T_target_source: (4, 4) first guess.
-            wide: the guess may be far off; take the time to search around it.
+
+        Raises:
+            RuntimeError: when the frames cannot be registered (Open3D's).
+        """
+        ...
+
+    def propose(self, source: Any, target: Any) -> Iterator[Pose]:
+        """First guesses of T_target_source (4, 4) from the images alone, the best one first."""
+        ...
+
+    def search(self, source: Any, target: Any, T_target_source: Pose) -> Pose:
+        """A better first guess (4, 4) where `T_target_source` may be far off.
+
+        Args:
+            source, target: what `prepare` returned.
+            T_target_source: (4, 4) what to search around.
 
         Raises:
             RuntimeError: when the frames cannot be registered (Open3D's).
@@ -132,19 +141,15 @@ class HybridRegistrar:
     def propose(self, source: Any, target: Any) -> Iterator[Pose]:
         return iter(())
 
+    def search(self, source: PreparedImages, target: PreparedImages, T_target_source: Pose) -> Pose:
+        limit = self._odometry.max_distance_m * WIDE_DISTANCE_FACTOR
+        found = self._hybrid(source, target, T_target_source, limit, WIDE_ITERATIONS)
+        return np.asarray(found.transformation.numpy())
+
     def register(
-        self,
-        source: PreparedImages,
-        target: PreparedImages,
-        T_target_source: Pose,
-        *,
-        wide: bool = False,
+        self, source: PreparedImages, target: PreparedImages, T_target_source: Pose
     ) -> Registration:
         limit = self._odometry.max_distance_m
-        if wide:
-            T_target_source = self._hybrid(
-                source, target, T_target_source, limit * WIDE_DISTANCE_FACTOR, WIDE_ITERATIONS
-            ).transformation.numpy()
         result = self._hybrid(source, target, T_target_source, limit, HYBRID_ITERATIONS)
         odometry = o3d.t.pipelines.odometry
         information = odometry.compute_odometry_information_matrix(
@@ -241,19 +246,20 @@ class ColoredIcpRegistrar:
     def propose(self, source: Any, target: Any) -> Iterator[Pose]:
         return iter(())
 
-    def register(
-        self, source: Any, target: Any, T_target_source: Pose, *, wide: bool = False
-    ) -> Registration:
+    def search(self, source: Any, target: Any, T_target_source: Pose) -> Pose:
+        registration = o3d.pipelines.registration
+        found = registration.registration_icp(
+            source,
+            target,
+            2.0 * self._odometry.max_distance_m * WIDE_DISTANCE_FACTOR,
+            T_target_source,
+            registration.TransformationEstimationPointToPlane(),
+        )
+        return np.array(found.transformation)
+
+    def register(self, source: Any, target: Any, T_target_source: Pose) -> Registration:
         registration = o3d.pipelines.registration
         limit = 2.0 * self._odometry.max_distance_m
-        if wide:
-            T_target_source = registration.registration_icp(
-                source,
-                target,
-                limit * WIDE_DISTANCE_FACTOR,
-                T_target_source,
-                registration.TransformationEstimationPointToPlane(),
-            ).transformation
         result = registration.registration_colored_icp(
             source,
             target,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,11 +78,16 @@ class PosePrior:
 
     Attributes:
         T_map_camera: (4, 4) mean.
-        information: (6, 6) of (translation [m], rotation [rad]) about the camera centre, map axes.
+        covariance: (6, 6) of (translation [m], rotation [rad]) about the camera centre, map axes.
     """
 
     T_map_camera: Pose
-    information: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    @cached_property
+    def information(self) -> NDArray[np.float64]:
+        """Inverse of the covariance (6, 6)."""
+        return np.asarray(np.linalg.inv(self.covariance), np.float64)
 
     def deviation(self, T_map_camera: Pose) -> NDArray[np.float64]:
         """How a pose differs from the mean (6,): (translation [m], rotation [rad]), map axes."""

@@ -12,7 +12,7 @@ from meslam_core.frame_result import TrackingState
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.odometry import MotionNoise, OdometryEstimate
 from meslam_core.regions.region import Region
-from meslam_core.se3 import Pose, orthonormalized
+from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.frame_history import FrameHistory
 
@@ -20,6 +20,10 @@ from meslam_core.tracking.frame_history import FrameHistory
 CONFIDENT_INLIERS = 0.85
 UNTRUSTED_VARIANCE = 0.25
 FIRST_VARIANCE = 1e-8
+# Of the pose that a run in a known map is said to begin at.
+START_VARIANCE = 0.01
+# How far the last motion, continued, may be wrong where odometry says nothing.
+CONTINUED_NOISE = MotionNoise(distance_m=0.02, angle_rad=0.03, drift=0.5)
 
 
 @dataclass(frozen=True)
@@ -55,14 +59,16 @@ class FrameTracking:
 
     Args:
         config: limits of what is believed.
+        T_map_first: (4, 4) where the first frame is believed to be.
 
     Attributes:
         history: of all frames; who maps the frame adds it.
         state: after the latest frame.
     """
 
-    def __init__(self, config: TrackingConfig) -> None:
+    def __init__(self, config: TrackingConfig, T_map_first: Pose | None = None) -> None:
         self.config = config
+        self._T_map_first = np.eye(4) if T_map_first is None else T_map_first
         self.history = FrameHistory()
         self.state = TrackingState.INITIALISING
         self._tracker = FieldTracker(config)
@@ -88,8 +94,9 @@ class FrameTracking:
         """
         alignment = None
         verdict = _Verdict(trusted=False, reason="too few pixels with depth")
+        prior = self._prior(stamp_ns, odometry)
         if rays is not None:
-            alignment = self._align(stamp_ns, region, rays, odometry)
+            alignment = self._align(region, rays, self._guesses(stamp_ns, odometry), prior)
             verdict = self._judge(alignment, odometry)
         if alignment is not None and verdict.by_field:
             self._untrusted = 0
@@ -100,16 +107,16 @@ class FrameTracking:
             self._untrusted = 0 if verdict.trusted else self._untrusted + 1
             lost = self._untrusted >= self.config.lost_after_frames
             self.state = TrackingState.LOST if lost else TrackingState.DEGRADED
-            pose = self._guesses(stamp_ns, odometry)[0]
-            self._covariance = np.eye(6) * UNTRUSTED_VARIANCE
+            pose = prior.T_map_camera
+            # Uncertainty grows from where it was: without a bound, the next frame could slide
+            # anywhere along a plain wall.
+            self._covariance = np.eye(6) * UNTRUSTED_VARIANCE if lost else prior.covariance
         return TrackedPose(pose, self._covariance, verdict.trusted, verdict.reason, alignment)
 
     def _align(
-        self, stamp_ns: int, region: Region, rays: Rays, odometry: OdometryEstimate | None
+        self, region: Region, rays: Rays, guesses: list[Pose], prior: PosePrior
     ) -> Alignment:
         """The best alignment with a region from all first guesses that are worth trying."""
-        guesses = self._guesses(stamp_ns, odometry)
-        prior = self._prior(odometry)
         alignments: list[Alignment] = []
         for guess in self._tracker.ranked(region, rays, guesses):
             alignments.append(self._tracker.align(region, rays, guess, prior))
@@ -117,19 +124,25 @@ class FrameTracking:
                 break
         return max(alignments, key=lambda alignment: alignment.inlier_ratio)
 
-    def _prior(self, odometry: OdometryEstimate | None) -> PosePrior | None:
-        """The last pose moved by odometry, as certain as both are."""
+    def _prior(self, stamp_ns: int, odometry: OdometryEstimate | None) -> PosePrior:
+        """The last pose moved by odometry, or else by the last motion; as certain as both are."""
+        if not len(self.history):
+            return PosePrior(self._T_map_first.copy(), np.eye(6) * START_VARIANCE)
         moved = self.history.moved(odometry)
-        if moved is None:
-            return None
-        T_map_last, motion = moved
-        noise = (odometry.noise if odometry else None) or self._noise
+        if moved is not None:
+            T_map_last, motion = moved
+            noise = (odometry.noise if odometry else None) or self._noise
+        else:
+            T_map_last, noise = self.history.pose(-1), CONTINUED_NOISE
+            motion = inverse(T_map_last) @ self.history.extrapolated(stamp_ns)
         variances = np.repeat(np.square(noise.deviations(motion)), 3)
         covariance = self._covariance + np.diag(variances)
-        return PosePrior(orthonormalized(T_map_last @ motion), inverted(covariance))
+        return PosePrior(orthonormalized(T_map_last @ motion), covariance)
 
     def _guesses(self, stamp_ns: int, odometry: OdometryEstimate | None) -> list[Pose]:
         """First guesses of a pose: odometry since the last frame, constant velocity, standstill."""
+        if not len(self.history):
+            return [self._T_map_first.copy()]
         guesses = []
         moved = self.history.moved(odometry)
         if moved is not None:

@@ -1,0 +1,82 @@
+"""Which registrations are tried, and which of them is believed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from data.textured_room import frame_at, path
+
+from meslam_core.config import MeslamConfig
+from meslam_core.odometry.keyframe_odometry import SAME_MOTION_M, KeyframeOdometry
+from meslam_core.odometry.registration import Registration
+from meslam_core.se3 import Pose, exp
+
+FRAMES = [frame_at(pose, number) for number, pose in enumerate(path(2))]
+TRUE = exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0]))
+"""What registration finds from a start near it."""
+
+
+class Scripted:
+    """Registers well from near `TRUE` and badly, staying where it is, from anywhere else."""
+
+    def __init__(self, proposed: list[Pose], searched: Pose, **bad: float) -> None:
+        self.starts: list[Pose] = []
+        self.searches = 0
+        self._proposed, self._searched = proposed, searched
+        self._bad = {"fitness": 0.9, "agreement": 0.9, **bad}
+
+    def prepare(self, frame):
+        return frame
+
+    def propose(self, source, target):
+        return iter(self._proposed)
+
+    def search(self, source, target, T_target_source):
+        self.searches += 1
+        return self._searched
+
+    def register(self, source, target, T_target_source):
+        self.starts.append(T_target_source)
+        if np.linalg.norm((T_target_source - TRUE)[:3, 3]) < 0.005:
+            return Registration(TRUE, np.eye(6), 0.95, 0.001, 0.95)
+        return Registration(T_target_source, np.eye(6), residual_m=0.01, **self._bad)
+
+
+def second_estimate(registrar: Scripted):
+    config = MeslamConfig()
+    follower = KeyframeOdometry(registrar, config.odometry, config.sensor)
+    follower.process(FRAMES[0])
+    return follower.process(FRAMES[1])
+
+
+def test_a_good_fit_after_a_slow_motion_is_taken_at_once():
+    registrar = Scripted([], TRUE)
+    assert second_estimate(registrar).valid
+    assert len(registrar.starts) == 1
+    assert registrar.searches == 0
+
+
+@pytest.mark.parametrize(
+    "bad", [{"fitness": 0.4}, {"agreement": 0.2}], ids=["fitness", "agreement"]
+)
+@pytest.mark.parametrize("helper", ["proposal", "search"])
+def test_a_bad_fit_is_searched_for_a_better_one(bad, helper):
+    far = exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    proposed, searched = ([TRUE], far) if helper == "proposal" else ([far], TRUE)
+    estimate = second_estimate(Scripted(proposed, searched, **bad))
+    assert estimate.valid
+    np.testing.assert_allclose(estimate.T_odom_camera, TRUE, atol=1e-9)
+
+
+def test_a_start_where_another_registration_ended_is_not_tried_again():
+    near = TRUE @ exp(np.array([0.5 * SAME_MOTION_M, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    registrar = Scripted([TRUE, near], near, agreement=0.2)
+    assert second_estimate(registrar).valid
+    assert len(registrar.starts) == 2
+
+
+def test_what_fits_nowhere_is_reported():
+    far = exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    estimate = second_estimate(Scripted([], far, agreement=0.2))
+    assert not estimate.valid
+    assert "20%" in estimate.reason

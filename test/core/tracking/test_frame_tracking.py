@@ -1,0 +1,71 @@
+"""A frame's pose where the map or odometry says little."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meslam_core.config import TrackingConfig
+from meslam_core.frame_result import TrackingState
+from meslam_core.mapping.keyframes import Rays, rays_at
+from meslam_core.tracking import frame_tracking
+from meslam_core.tracking.frame_history import KeyframePoses
+from meslam_core.tracking.frame_tracking import UNTRUSTED_VARIANCE, FrameTracking
+
+PERIOD_NS = 66_666_667
+
+
+def resting(room, **settings) -> FrameTracking:
+    """Tracking whose camera has stood still at the room's first pose for two frames."""
+    tracking = FrameTracking(TrackingConfig(**settings))
+    tracking.start(room.poses[0])
+    tracking.history.keyframes = KeyframePoses(room.keyframes)
+    for number in range(2):
+        tracking.history.add(number * PERIOD_NS, room.poses[0], 0, np.eye(4), None)
+    return tracking
+
+
+def bare_wall(room) -> Rays:
+    """Rays of the first frame that all end on one plain wall."""
+    frame, pose = room.frame(0), room.poses[0]
+    rows, columns = np.mgrid[2 : frame.camera.height : 2, 2 : frame.camera.width : 2].reshape(2, -1)
+    rays = rays_at(frame, rows, columns)
+    ends = (rays.directions * rays.distances_m[:, None]).numpy() @ pose[:3, :3].T + pose[:3, 3]
+    wall = np.abs(ends[:, 0] - 2.1) < 0.01
+    assert wall.sum() > 300
+    return Rays(rays.directions[wall], rays.distances_m[wall], rays.colors[wall])
+
+
+def test_without_odometry_the_last_motion_keeps_the_pose_along_a_bare_wall(
+    mapped_room, monkeypatch
+):
+    """The wall tells one distance and two angles; the rest must not drift away."""
+    rays, true = bare_wall(mapped_room), mapped_room.poses[0]
+
+    def slid() -> float:
+        tracking = resting(mapped_room, color_weight=0.0)
+        tracked = tracking.track(2 * PERIOD_NS, mapped_room.region, rays, None)
+        assert tracked.trusted
+        return float(np.linalg.norm((tracked.T_map_camera - true)[:3, 3]))
+
+    kept = slid()
+    loose = frame_tracking.MotionNoise(distance_m=10.0, angle_rad=10.0, drift=0.0)
+    monkeypatch.setattr(frame_tracking, "CONTINUED_NOISE", loose)
+    assert kept < 0.01
+    assert kept < 0.5 * slid()
+
+
+def test_uncertainty_grows_from_where_it_was_until_the_pose_is_lost(mapped_room):
+    tracking = resting(mapped_room, lost_after_frames=4)
+    deviations = []
+    for number in range(4):
+        stamp_ns = (2 + number) * PERIOD_NS
+        tracked = tracking.track(stamp_ns, mapped_room.region, None, None)
+        assert not tracked.trusted
+        tracking.history.add(stamp_ns, tracked.T_map_camera, 0, np.eye(4), None)
+        deviations.append(np.sqrt(tracked.covariance[0, 0]))
+        expected = TrackingState.LOST if number == 3 else TrackingState.DEGRADED
+        assert tracking.state is expected
+    assert 0.01 < deviations[0] < 0.05
+    assert deviations[0] < deviations[1] < deviations[2] < 0.1
+    assert deviations[3] == pytest.approx(np.sqrt(UNTRUSTED_VARIANCE))

@@ -46,7 +46,7 @@ def _shell() -> list[Patch]:
         "east": textures.plaster((0.86, 0.80, 0.68), roughness=0.04),
     }
     patches = [
-        (wall := CHAMBER.wall(side)).hung(0.0, HEIGHT_M, wall.length_m, HEIGHT_M, paper, 0.003)
+        (face := CHAMBER.wall(side)).hung(0.0, HEIGHT_M, face.length_m, HEIGHT_M, paper, 0.003)
         for side, paper in papers.items()
     ]
     ceiling = textures.checker((0.86, 0.86, 0.84), (0.80, 0.80, 0.79), 0.6)

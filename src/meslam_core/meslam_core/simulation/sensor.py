@@ -85,7 +85,7 @@ class D435:
         self, view: View, rng: np.random.Generator, exposure: float = 1.0
     ) -> NDArray[np.uint8]:
         """Colour image (H, W, 3) uint8: slightly soft, with noise that grows with the signal."""
-        soft = np.asarray(cv2.GaussianBlur(view.color, (0, 0), 0.55))
+        soft = np.asarray(cv2.GaussianBlur(view.color, (0, 0), 0.55), np.float32)
         soft *= np.float32(exposure)
         strength = soft * np.float32(1 / 128)
         strength += np.float32(0.15)

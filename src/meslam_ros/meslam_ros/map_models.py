@@ -47,6 +47,7 @@ class MapModels:
         self._catalog = RegionCatalog()
         self._config = config
         self._map_frame = map_frame
+        self._lattice: RegionGrid | None = None
         self._regions: dict[RegionIndex, StoredRegion] = {}
         self._data: dict[RegionIndex, bytes] = {}
         self._live_map_id = ""
@@ -135,6 +136,7 @@ class MapModels:
         # Networks that were stored with this precision encode to the very same bytes again.
         with self._lock:
             self._begin(loaded.map_id)
+            self._lattice = loaded.grid
             self._replaced_map_id = self._live_map_id if self._live_map_id != loaded.map_id else ""
             for region, model in zip(loaded.regions, models, strict=True):
                 self._catalog.add(RegionEntry.of(model))
@@ -144,12 +146,15 @@ class MapModels:
 
     def _begin(self, map_id: str) -> None:
         self._catalog.begin(map_id)
+        self._lattice = None
         self._regions.clear()
         self._data.clear()
         self._snapshot = None
 
     def _grid(self) -> RegionGrid:
-        """The lattice, as the first region and the configured overlap tell it."""
+        """A loaded map's lattice, else the one that the first region and the overlap tell."""
+        if self._lattice is not None:
+            return self._lattice
         region = next(iter(self._regions.values()))
         grid = RegionGrid(np.zeros(3), region.side_m, self._config.regions.overlap)
         origin = region.T_map_region[:3, 3] - grid.center(region.index)

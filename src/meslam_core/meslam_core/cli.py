@@ -133,6 +133,18 @@ def run(
             "built-in odometry.",
         ),
     ] = None,
+    stored: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="MAP", help="A stored map to go on with, in its frame."),
+    ] = None,
+    start_pose: Annotated[
+        str,
+        typer.Option(
+            metavar="'X Y Z QX QY QZ QW'",
+            help="Where in that map the first image was taken, to a few centimetres and degrees; "
+            "or a TUM file whose first line says it.",
+        ),
+    ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Of every random choice.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -152,12 +164,19 @@ def run(
     limit_threads(config.runtime.threads)
     from meslam_core import pipeline
     from meslam_core.console import RunBar, error_console
+    from meslam_core.continuation import read_continuation
     from meslam_core.recordings import open_recording
 
-    source = open_recording(recording, intrinsics)
     options = pipeline.RunOptions(
-        chosen, realtime, truth, hand_eye=lever_arm, odometry=odometry, seed=seed
+        chosen,
+        realtime,
+        truth,
+        hand_eye=lever_arm,
+        odometry=odometry,
+        continuation=read_continuation(stored, start_pose),
+        seed=seed,
     )
+    source = open_recording(recording, intrinsics)
     try:
         with RunBar(error_console()) as bar:
             outcome = pipeline.run(source, config, out, options, bar)

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from meslam_core.config import MeslamConfig
+from meslam_core.continuation import Continuation
 from meslam_core.errors import EvaluationError, FrameError, RecordingError
 from meslam_core.evaluation.report import truth_entries
 from meslam_core.interruption import stop_request
-from meslam_core.map.store import MapStore
-from meslam_core.map.stored_region import StoredRegion, snapshot
 from meslam_core.odometry import GivenOdometry, make_odometry
 from meslam_core.odometry_worker import OdometryWorker
 from meslam_core.pacing import PacedFrames
 from meslam_core.recordings.recording import Recording
 from meslam_core.results import MAP, ONLINE_TRAJECTORY, TRAJECTORY, ResultFolder
 from meslam_core.run_report import Tally, map_entries, run_environment
+from meslam_core.session_map import write_map
 from meslam_core.slam import FrameResult, Slam, TrackingState
 from meslam_core.threads import limit_threads
 from meslam_core.trajectory import Trajectory, read_tum, write_tum
@@ -68,6 +67,7 @@ class RunOptions:
         hand_eye: the truth is the pose of another sensor on the same mount; find its place too.
         odometry: poses of the camera in TUM format, in any frame, that take the place of the
             built-in odometry.
+        continuation: a stored map to go on with.
         seed: of every random choice.
     """
 
@@ -76,6 +76,7 @@ class RunOptions:
     truth: Path | None = None
     hand_eye: bool = False
     odometry: Path | None = None
+    continuation: Continuation | None = None
     seed: int = 0
 
 
@@ -139,7 +140,10 @@ def run(
         write_tum(results.incomplete(TRAJECTORY), refined)
         write_tum(results.incomplete(ONLINE_TRAJECTORY), online)
         report = loop.report()
-        report["map_bytes"] = _write_map(slam, loop.tally.last_stamp_ns, results.incomplete(MAP))
+        map_id = options.continuation.map_id if options.continuation else None
+        report["map_bytes"] = write_map(
+            slam, loop.tally.last_stamp_ns, results.incomplete(MAP), map_id
+        )
         not_evaluated = ""
         if truth is not None:
             not_evaluated = _evaluate(refined, online, truth, options.hand_eye, report)
@@ -177,7 +181,13 @@ class _Loop:
         self.skipped = 0
         self.online_s = 0.0
         self.wall_s = 0.0
-        self.slam = Slam(config, options.seed, frames_wait=self._frames_wait)
+        self.slam = Slam(
+            config,
+            options.seed,
+            frames_wait=self._frames_wait,
+            continuation=options.continuation,
+        )
+        config = self.slam.config
         self._config = config
         self._recording = recording
         self._worker: OdometryWorker | None = None
@@ -253,25 +263,6 @@ class _Loop:
             "realtime": self._options.realtime,
             "config": self._config.to_mapping(),
         }
-
-
-def _write_map(slam: Slam, stamp_ns: int, path: Path) -> int:
-    """Store the map of all frames up to a stamp and return its size [bytes]."""
-    if slam.atlas is None:
-        return 0
-    store = MapStore(path)
-    store.save(_snapshots(slam, stamp_ns), slam.atlas.grid, precision=slam.config.map.codec)
-    return store.map_bytes
-
-
-def _snapshots(slam: Slam, stamp_ns: int) -> Iterator[StoredRegion]:
-    """The regions one after the other: those at rest are in memory only while they are written."""
-    assert slam.atlas is not None
-    active = slam.atlas.active
-    for region in slam.atlas.regions.values():
-        trained = slam.keyframes.stamps_ns[max(region.keyframes)]
-        newest = stamp_ns if any(region is each for each in active) else trained
-        yield snapshot(region, newest)
 
 
 def _evaluate(

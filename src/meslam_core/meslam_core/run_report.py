@@ -88,7 +88,7 @@ def map_entries(slam: Slam) -> dict[str, Any]:
     if slam.atlas is None:
         return {"keyframes": 0, "regions": 0, "observed_volume_m3": 0.0}
     return {
-        "keyframes": len(slam.keyframes),
+        "keyframes": len(slam.keyframes) - slam.remembered,
         "regions": len(slam.atlas.regions),
         "observed_volume_m3": observed_volume_m3(slam),
     }

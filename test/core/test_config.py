@@ -91,7 +91,9 @@ def test_every_setting_is_described_and_its_default_is_allowed(setting):
         assert setting.maximum is not None
     suffixes = {"m": "_m", "s": "_s", "ms": "_ms", "deg": "_deg"}
     for unit, suffix in suffixes.items():
-        if setting.name.endswith(suffix) and not setting.name.endswith(("_m_s", "_deg_s", "_deg_m")):
+        if setting.name.endswith(suffix) and not setting.name.endswith(
+            ("_m_s", "_deg_s", "_deg_m")
+        ):
             assert setting.unit == unit
 
 

@@ -273,7 +273,7 @@ class Slam:
         its neighbours refine the same keyframes.
         """
         regions = len(self._touched) if self.atlas else 0
-        return round(self.config.mapping.final_iterations * max(regions, 1) ** 0.5)
+        return round(self.config.mapping.final_iterations * math.sqrt(max(regions, 1)))
 
     @property
     def _touched(self) -> list[Region]:
@@ -401,7 +401,7 @@ class Slam:
         started = time.perf_counter()
         self.atlas.settle()
         if linked is not None and self._linker is not None:
-            for link in self._linker.link(*linked):
+            for link in self._linker.link(*linked, self._frames_wait):
                 self.keyframes.add_link(link.first, link.second, link.T_first_second)
             if self.recogniser is not None:
                 corrections = self.recogniser.corrections

@@ -6,7 +6,7 @@ again what an older one saw is registered with it directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -27,6 +27,7 @@ from meslam_core.se3 import Pose, inverse, rotation_angle
 JUDGED_POINTS = 64
 MIN_OVERLAP = 0.5
 ATTEMPTS_A_LINK = 2
+LEAST_ATTEMPTS = 3
 MIN_FITNESS = 0.6
 MIN_AGREEMENT = 0.3
 # A registration farther from where the keyframes are believed to be is not believed itself.
@@ -78,19 +79,26 @@ class CovisibilityLinker:
         self._reach_m = config.sensor.max_depth_m
         self._images = KeyframeImages(scratch)
 
-    def link(self, keyframe: int, frame: RgbdFrame, rays: Rays) -> list[CovisibilityLink]:
+    def link(
+        self,
+        keyframe: int,
+        frame: RgbdFrame,
+        rays: Rays,
+        frames_wait: Callable[[], bool] = lambda: False,
+    ) -> list[CovisibilityLink]:
         """Register a new keyframe with up to `config.links` older ones.
 
         Args:
             keyframe: number of the new one.
             frame: its images; they are kept for keyframes to come.
             rays: its sample, camera frame.
+            frames_wait: while they do, no more than `LEAST_ATTEMPTS` registrations are made.
         """
         image = KeyframeImage.of(frame, self._width)
         older = islice(
             self._candidates(keyframe, frame.camera, rays), ATTEMPTS_A_LINK * self._links
         )
-        links = self._register_all(keyframe, image, older)
+        links = self._register_all(keyframe, image, older, frames_wait)
         self._images.add(keyframe, image)
         return links
 
@@ -148,12 +156,16 @@ class CovisibilityLinker:
         return near and rotation_angle(apart) < SAME_PLACE_RAD
 
     def _register_all(
-        self, keyframe: int, image: KeyframeImage, others: Iterable[int]
+        self,
+        keyframe: int,
+        image: KeyframeImage,
+        others: Iterable[int],
+        frames_wait: Callable[[], bool] = lambda: False,
     ) -> list[CovisibilityLink]:
         links: list[CovisibilityLink] = []
         prepared = self._registrar.prepare(image.frame())
-        for other in others:
-            if len(links) >= self._links:
+        for attempt, other in enumerate(others):
+            if len(links) >= self._links or (attempt >= LEAST_ATTEMPTS and frames_wait()):
                 break
             T_other_keyframe = self._register(other, keyframe, prepared)
             if T_other_keyframe is not None:

@@ -37,7 +37,7 @@ SEARCHED_TURNS = [
     for yaw in (0.0, -8.0, 8.0, -16.0, 16.0)
     for pitch in (0.0, -8.0, 8.0)
 ]
-CONVERGENCE = 5e-4
+CONVERGENCE = 1e-3
 # Neighbouring residuals err together: so many tell as much as one.
 CORRELATED = 50.0
 MIN_VISIBLE = 300

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +27,10 @@ class MotionNoise:
     angle_rad: float
     drift: float
     drift_rad_m: float = 0.0
+
+    def over(self, times: float) -> MotionNoise:
+        """The noise of `times` as long a motion, as far as it does not depend on the motion."""
+        return replace(self, distance_m=times * self.distance_m, angle_rad=times * self.angle_rad)
 
     def deviations(self, motion: Pose) -> tuple[float, float]:
         """Error of the distance [m] and of the angle [rad] of a motion (4, 4)."""

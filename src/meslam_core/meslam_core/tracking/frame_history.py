@@ -111,6 +111,11 @@ class FrameHistory:
         self._handovers[reference] = (T_reference_next, self._count)
 
     @property
+    def last_stamp_ns(self) -> int:
+        """Stamp of the latest frame's image [ns]."""
+        return int(self._stamps_ns[self._count - 1])
+
+    @property
     def newest_keyframe(self) -> int:
         """Number of the latest keyframe."""
         assert self.keyframes is not None

@@ -22,8 +22,9 @@ UNTRUSTED_VARIANCE = 0.25
 FIRST_VARIANCE = 1e-8
 # Of the pose that a run in a known map is said to begin at.
 START_VARIANCE = 0.01
-# How far the last motion, continued, may be wrong where odometry says nothing.
-CONTINUED_NOISE = MotionNoise(distance_m=0.02, angle_rad=0.03, drift=0.5)
+# How far the last motion, continued for a second, may be wrong where odometry says nothing.
+CONTINUED_NOISE = MotionNoise(distance_m=0.3, angle_rad=0.45, drift=0.5)
+NANOSECONDS = 1e-9
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ class FrameTracking:
             T_map_last, motion = moved
             noise = (odometry.noise if odometry else None) or self._noise
         else:
-            T_map_last, noise = self.history.pose(-1), CONTINUED_NOISE
+            T_map_last = self.history.pose(-1)
+            noise = CONTINUED_NOISE.over((stamp_ns - self.history.last_stamp_ns) * NANOSECONDS)
             motion = inverse(T_map_last) @ self.history.extrapolated(stamp_ns)
         variances = np.repeat(np.square(noise.deviations(motion)), 3)
         covariance = self._covariance + np.diag(variances)

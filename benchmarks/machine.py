@@ -36,3 +36,17 @@ def machine_line(described: dict[str, Any]) -> str:
     sets = ", ".join(described["instruction_sets"])
     versions = ", ".join(f"{name} {version}" for name, version in described["versions"].items())
     return f"{described['cpu']}, {described['cores']} cores ({sets}); {versions}"
+
+
+def memory_mb(pid: int) -> tuple[float, float]:
+    """Resident set of a process now and at its largest [MB], from Linux's /proc."""
+    entries = dict(
+        line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+    )
+    return _megabytes(entries["VmRSS"]), _megabytes(entries["VmHWM"])
+
+
+def _megabytes(text: str) -> float:
+    kibibytes, unit = text.split()
+    assert unit == "kB"
+    return int(kibibytes) * 1024 / 1e6

@@ -25,7 +25,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from machine import machine, machine_line
+from machine import machine, machine_line, memory_mb
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -193,20 +193,6 @@ def measure(path: Path, minutes: float, overrides: Sequence[str]) -> list[Sample
     if process.returncode:
         raise SystemExit(f"the run ended with status {process.returncode}")
     return samples
-
-
-def memory_mb(pid: int) -> tuple[float, float]:
-    """Resident set of a process now and at its largest [MB], from Linux's /proc."""
-    entries = dict(
-        line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines()
-    )
-    return _megabytes(entries["VmRSS"]), _megabytes(entries["VmHWM"])
-
-
-def _megabytes(text: str) -> float:
-    kibibytes, unit = text.split()
-    assert unit == "kB"
-    return int(kibibytes) * 1024 / 1e6
 
 
 def peak_after(samples: Sequence[Sample], sensor_s: float) -> float:

@@ -36,7 +36,7 @@ from meslam_core.camera import PinholeCamera
 from meslam_core.config import KeyframesConfig, MeslamConfig, SensorConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.se3 import Pose, interpolate, inverse, rotation_angle
-from meslam_core.slam import LAST_RATE_FACTOR, T_BODY_OPTICAL
+from meslam_core.slam import T_BODY_OPTICAL
 from meslam_core.threads import limit_threads
 from meslam_core.trajectory import Trajectory, read_tum
 
@@ -50,6 +50,7 @@ from meslam_core.map.neural_map import NeuralMap  # noqa: E402
 from meslam_core.map.stored_region import snapshot  # noqa: E402
 from meslam_core.mapping.joint_optimizer import JointOptimizer  # noqa: E402
 from meslam_core.mapping.keyframes import KeyframeStore, rays_at  # noqa: E402
+from meslam_core.mapping.refinement import LAST_RATE_FACTOR  # noqa: E402
 from meslam_core.recordings.registry import open_recording  # noqa: E402
 from meslam_core.regions.atlas import RegionAtlas  # noqa: E402
 from meslam_core.tracking.pixels import choose_pixels, trusted_pixels  # noqa: E402

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from meslam_core.config import MeslamConfig
+from meslam_core.mapping.frame_training import FIRST_STEPS_SHARE, MADE_UP_A_FRAME
 from meslam_core.odometry import make_odometry
-from meslam_core.slam import FIRST_STEPS_SHARE, MADE_UP_A_FRAME, Slam
+from meslam_core.slam import Slam
 
 FIRST, LEAST, STEPS = 100, 3, 8
 FIRST_LEAST = math.ceil(FIRST_STEPS_SHARE * FIRST)
@@ -55,7 +56,7 @@ def steps_of(slam: Slam, offered) -> list[int]:
     for frame, odometry in offered:
         slam.process(frame, odometry)
         slam.wait()
-        taken.append(slam._latest_training.losses.steps)
+        taken.append(slam._training.latest.losses.steps)
     return taken
 
 
@@ -128,7 +129,7 @@ def test_waiting_for_training_or_not_changes_nothing(config, offered):
         slam = Slam(config)
         for pair in offered:
             slam.track(*pair)
-            training = slam._worker._running
+            training = slam._training and slam._training._worker._running
             if wait and training is not None:
                 training.result()
             slam.map()

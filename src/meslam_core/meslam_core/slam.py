@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -16,11 +14,13 @@ from meslam_core.field import field_device, make_field
 from meslam_core.frame import RgbdFrame
 from meslam_core.frame_result import FrameResult, TrackingState
 from meslam_core.loop.recognition import RegionRecogniser
-from meslam_core.mapping.covisibility import CovisibilityLinker
+from meslam_core.mapping.frame_training import FrameTraining, NewKeyframe
 from meslam_core.mapping.joint_optimizer import JointOptimizer
+from meslam_core.mapping.keyframe_chain import KeyframeChain
 from meslam_core.mapping.keyframe_policy import KeyframePolicy
 from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
-from meslam_core.mapping.training_worker import Training, TrainingWorker
+from meslam_core.mapping.refinement import REFINING_STEPS, Refinement
+from meslam_core.mapping.training_worker import Training
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.regions.observed_mask import ObservedMask
@@ -40,17 +40,6 @@ T_BODY_OPTICAL: Pose = np.array(
 )
 CURRENT_FRAME_RAYS = 4096
 MIN_FRAME_PIXELS = 200
-# Of the first frame's steps so many come before the next frame may be tracked; the following
-# frames make up for the rest, so many steps each.
-FIRST_STEPS_SHARE = 0.4
-MADE_UP_A_FRAME = 40
-# Odometry ties a keyframe to the one before; a registration of the two says it better.
-ODOMETRY_LINK_WEIGHT = 0.05
-# A refinement comes in portions of so many steps, the last at this share of the learning rate.
-REFINING_STEPS = 50
-# Of several regions each is refined so long before it is the next one's turn, on average.
-TURN_STEPS = 400
-LAST_RATE_FACTOR = 0.05
 
 
 @dataclass(frozen=True)
@@ -63,19 +52,6 @@ class _Pending:
     result: FrameResult
     reference: int
     T_reference_camera: Pose
-
-
-@dataclass
-class _Refinement:
-    """Whose turn it is.
-
-    Attributes:
-        region: number of the region that is refined, in the order of their creation.
-        left: steps that it still gets in this turn.
-    """
-
-    region: int = -1
-    left: int = 0
 
 
 class Slam:
@@ -120,6 +96,7 @@ class Slam:
         rays_rest = None if config.regions.single else self._scratch
         self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed, rays_rest)
         self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
+        self._chain = KeyframeChain(self.keyframes)
         self.policy = KeyframePolicy(config.keyframes, config.field)
         self.tracking = FrameTracking(config.tracking, T_map_camera)
         self._history = self.tracking.history
@@ -128,25 +105,16 @@ class Slam:
         self._seed = seed
         self._generator = np.random.default_rng(seed)
         self._T_map_first = T_map_camera
-        self._worker = TrainingWorker()
-        self._linker: CovisibilityLinker | None = None
-        if config.keyframes.links:
-            self._linker = CovisibilityLinker(self.keyframes, config, self._scratch)
-        self.recogniser: RegionRecogniser | None = None
-        self._trained: list[Region] = []
-        self._latest_training = Training()
-        self._steps_owed = 0
-        self._turn = 0
-        self._refined = _Refinement()
+        self._training: FrameTraining | None = None
+        self._refinement: Refinement | None = None
         self._pending: _Pending | None = None
-        self._keyframe_odometry: OdometryEstimate | None = None
         # What tracking sees of the working region while training changes the original.
         self._view: Region | None = None
         self._viewed_field = make_field(config.field, seed)
         # Keyframes that stand for an earlier session's.
         self.remembered = 0
         if continuation is not None:
-            self.atlas = continuation.atlas(config, self.keyframes, seed, self._scratch)
+            self._map_into(continuation.atlas(config, self.keyframes, seed, self._scratch))
             self.remembered = len(self.keyframes)
             self._look()
 
@@ -154,6 +122,11 @@ class Slam:
     def state(self) -> TrackingState:
         """Of tracking, after the latest frame."""
         return self.tracking.state
+
+    @property
+    def recogniser(self) -> RegionRecogniser | None:
+        """Asks regions that were come back to, where loops are closed."""
+        return self._training.recogniser if self._training else None
 
     def process(self, frame: RgbdFrame, odometry: OdometryEstimate | None = None) -> FrameResult:
         """Track one frame and begin to train the map with it.
@@ -211,8 +184,7 @@ class Slam:
         pending, self._pending = self._pending, None
         result, trusted = pending.result, pending.tracked.trusted
         trained = self._finish_training()
-        if result.odometry is not None and not result.odometry.valid:
-            self._keyframe_odometry = None
+        self._chain.pass_by(result.odometry)
         is_keyframe = trusted and self.atlas is None
         if is_keyframe:
             self._start(pending)
@@ -254,50 +226,15 @@ class Slam:
                 falls with it, and with it the noise that training leaves in the map.
         """
         self._finish_training()
-        if self.atlas is None or not self._touched:
-            return
-        rate_factor = 1.0 + progress * (LAST_RATE_FACTOR - 1.0)
-        while steps > 0:
-            region, portion = self._next_to_refine(steps)
-            with self.atlas.awake(region):
-                self.optimizer.train(region, portion, rate_factor=rate_factor)
-            region.version += 1
-            steps -= portion
-        self._look()
+        if self._refinement is not None:
+            self._refinement.train(steps, progress)
+            self._look()
 
     @property
     def refining_steps(self) -> int:
-        """How many steps a refinement of the whole map takes.
-
-        More than of a single region, but not in proportion: each of many was shorter in view, and
-        its neighbours refine the same keyframes.
-        """
-        regions = len(self._touched) if self.atlas else 0
-        return round(self.config.mapping.final_iterations * math.sqrt(max(regions, 1)))
-
-    @property
-    def _touched(self) -> list[Region]:
-        """The regions of this session: all but those that an earlier one left, unchanged."""
-        assert self.atlas is not None
-        return [region for region in self.atlas.regions.values() if not region.untouched]
-
-    def _next_to_refine(self, most: int) -> tuple[Region, int]:
-        """The region whose turn it is, and at most so many steps of those that it gets.
-
-        In one round every region gets steps in proportion to its keyframes, all at once: waking
-        it costs as much as some of them.
-        """
-        assert self.atlas is not None
-        regions = self._touched
-        if self._refined.left <= 0:
-            self._refined.region = (self._refined.region + 1) % len(regions)
-            mean = sum(len(each.keyframes) for each in regions) / len(regions)
-            share = len(regions[self._refined.region].keyframes) / max(mean, 1.0)
-            turn = REFINING_STEPS if len(regions) == 1 else TURN_STEPS
-            self._refined.left = max(1, round(turn * share))
-        portion = min(most, self._refined.left)
-        self._refined.left -= portion
-        return regions[self._refined.region % len(regions)], portion
+        """How many steps a refinement of the whole map takes."""
+        refinement = self._refinement
+        return refinement.steps if refinement else self.config.mapping.final_iterations
 
     def finish(self) -> None:
         """Refine once more over everything seen; then mark the observed space anew."""
@@ -309,12 +246,9 @@ class Slam:
     def settle(self) -> None:
         """Mark the observed space anew where the refined keyframes saw it."""
         self._finish_training()
-        if self.atlas is None:
-            return
-        for region in self._touched:
-            with self.atlas.awake(region):
-                region.version += self.atlas.rebuild_mask(region)
-        self._look()
+        if self._refinement is not None:
+            self._refinement.rebuild_masks()
+            self._look()
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every tracked frame as it is known now."""
@@ -329,16 +263,11 @@ class Slam:
 
     def _finish_training(self) -> Training:
         """Wait for the training that runs, and let tracking see what it did."""
-        trained = self._worker.wait()
-        if trained is None:
-            return self._latest_training
-        for region in self._trained:
-            region.version += 1
-        if self._steps_owed:
-            self._steps_owed = max(0, self._steps_owed - trained.losses.steps)
-        self._look()
-        self._latest_training = trained
-        return trained
+        if self._training is None:
+            return Training()
+        if self._training.wait():
+            self._look()
+        return self._training.latest
 
     def _look(self) -> None:
         """Let tracking see the map as it is now; no training runs."""
@@ -356,6 +285,7 @@ class Slam:
     def _begin_training(self, pending: _Pending, pose: Pose) -> bool:
         """Update regions and keyframes for a tracked frame and train; whether it is a keyframe."""
         assert self.atlas is not None
+        assert self._training is not None
         frame, pixels = pending.frame, pending.pixels
         self.atlas.update(pose[:3, 3])
         is_keyframe = self.policy.is_keyframe(
@@ -366,108 +296,34 @@ class Slam:
             pose,
             self._sample(frame, pixels, self.policy.PIXELS),
         )
-        linked = None
-        if is_keyframe:
-            linked = self._add_keyframe(frame, pixels, pose, pending.result.odometry)
+        keyframe = self._add_keyframe(pending, pose) if is_keyframe else None
         current = self._sample(frame, pixels, CURRENT_FRAME_RAYS)
-        mapping = self.config.mapping
-        steps = mapping.keyframe_iterations if is_keyframe else mapping.iterations
-        steps += min(self._steps_owed, MADE_UP_A_FRAME)
         self._look()
-        self._trained = self._next_to_train()
-        self._worker.start(partial(self._train, self._trained, steps, current, pose, linked))
+        self._training.start(current, pose, keyframe)
         return is_keyframe
-
-    def _next_to_train(self) -> list[Region]:
-        """The working region, and in turn one of the others that contain the camera.
-
-        So a frame costs the same at a corner, where eight regions meet, as between two.
-        """
-        assert self.atlas is not None
-        others = [region for region in self.atlas.training if region.confirmed]
-        self._turn += 1
-        return [self.atlas.working, *(others[self._turn % len(others)] for _ in others[:1])]
-
-    def _train(
-        self,
-        regions: list[Region],
-        steps: int,
-        current: Rays,
-        pose: Pose,
-        linked: tuple[int, RgbdFrame, Rays] | None,
-    ) -> Training:
-        """Train the working region, which comes first, and the other one half as long."""
-        assert self.atlas is not None
-        started = time.perf_counter()
-        self.atlas.settle()
-        if linked is not None and self._linker is not None:
-            for link in self._linker.link(*linked, self._frames_wait):
-                self.keyframes.add_link(link.first, link.second, link.T_first_second)
-            if self.recogniser is not None:
-                corrections = self.recogniser.corrections
-                for region in self.atlas.doubtful[:1]:
-                    self.recogniser.ask(region, *linked)
-                if self.recogniser.corrections > corrections:
-                    pose = self.keyframes.pose(linked[0])
-        least = self.config.mapping.min_iterations
-        losses = self.optimizer.train(
-            regions[0], steps, current, pose, enough=partial(self._may_end, least)
-        )
-        for region in regions[1:]:
-            self.optimizer.train(
-                region,
-                steps // 2,
-                current,
-                pose,
-                refine_poses=False,
-                enough=partial(self._may_end, least // 2),
-            )
-        return Training(losses, (time.perf_counter() - started) * 1e3)
-
-    def _may_end(self, least: int, done: int) -> bool:
-        return done >= least and self._frames_wait()
 
     def _start(self, pending: _Pending) -> None:
         """The first frame defines the map frame and trains the first region from nothing."""
-        frame, pose = pending.frame, pending.tracked.T_map_camera
-        self.atlas = RegionAtlas(
-            self.config, pose[:3, 3], self.keyframes, self._seed, self._scratch
+        pose = pending.tracked.T_map_camera
+        training = self._map_into(
+            RegionAtlas(self.config, pose[:3, 3], self.keyframes, self._seed, self._scratch)
         )
-        if self._linker is not None and self.config.regions.close_loops:
-            self.recogniser = RegionRecogniser(self.atlas, self._linker)
-        self._add_keyframe(frame, pending.pixels, pose, pending.result.odometry)
-        self._trained = [self.atlas.working]
-        self._steps_owed = self.config.mapping.first_iterations
-        self._worker.start(self._train_first)
+        self._add_keyframe(pending, pose)
+        training.start_first()
 
-    def _train_first(self) -> Training:
-        assert self.atlas is not None
-        started = time.perf_counter()
-        least = math.ceil(FIRST_STEPS_SHARE * self._steps_owed)
-        losses = self.optimizer.train(
-            self.atlas.working,
-            self._steps_owed,
-            refine_poses=False,
-            enough=partial(self._may_end, least),
+    def _map_into(self, atlas: RegionAtlas) -> FrameTraining:
+        """From now on these regions are trained and refined."""
+        self.atlas = atlas
+        self._refinement = Refinement(atlas, self.optimizer)
+        self._training = FrameTraining(
+            self.config, atlas, self.optimizer, self._scratch, self._frames_wait
         )
-        return Training(losses, (time.perf_counter() - started) * 1e3)
+        return self._training
 
-    def _add_keyframe(
-        self,
-        frame: RgbdFrame,
-        pixels: TrustedPixels,
-        pose: Pose,
-        odometry: OdometryEstimate | None,
-    ) -> tuple[int, RgbdFrame, Rays]:
-        """Make the frame a keyframe, linked to the last one where odometry never failed since."""
+    def _add_keyframe(self, pending: _Pending, pose: Pose) -> NewKeyframe:
         assert self.atlas is not None
-        rays = self._sample(frame, pixels, self.config.keyframes.rays)
-        link = None
-        if odometry is not None and self._keyframe_odometry is not None:
-            link = inverse(self._keyframe_odometry.T_odom_camera) @ odometry.T_odom_camera
-        self._keyframe_odometry = odometry if odometry is not None and odometry.valid else None
-        number = self.keyframes.add(frame.stamp_ns, pose, rays)
-        if link is not None:
-            self.keyframes.add_link(number - 1, number, link, ODOMETRY_LINK_WEIGHT)
+        frame = pending.frame
+        rays = self._sample(frame, pending.pixels, self.config.keyframes.rays)
+        number = self._chain.add(frame.stamp_ns, pose, rays, pending.result.odometry)
         self.atlas.add_keyframe(number)
         return number, frame, rays

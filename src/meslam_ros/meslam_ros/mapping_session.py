@@ -10,10 +10,11 @@ from contextlib import contextmanager, nullcontext
 from meslam_core import se3
 from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
+from meslam_core.mapping.refinement import REFINING_STEPS
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.grid import RegionIndex
 from meslam_core.regions.region import Region
-from meslam_core.slam import REFINING_STEPS, FrameResult, Slam, TrackingState
+from meslam_core.slam import FrameResult, Slam, TrackingState
 from meslam_core.trajectory import Trajectory
 from meslam_ros.odometry_messages import first_base_pose
 from meslam_ros.transforms import CameraMount

@@ -1,0 +1,170 @@
+"""What training does with each frame, beside the tracking of the next one."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+
+from meslam_core.config import MeslamConfig
+from meslam_core.frame import RgbdFrame
+from meslam_core.loop.recognition import RegionRecogniser
+from meslam_core.mapping.covisibility import CovisibilityLinker
+from meslam_core.mapping.joint_optimizer import JointOptimizer
+from meslam_core.mapping.keyframes import Rays
+from meslam_core.mapping.training_worker import Training, TrainingWorker
+from meslam_core.regions.atlas import RegionAtlas
+from meslam_core.regions.region import Region
+from meslam_core.scratch import ScratchFile
+from meslam_core.se3 import Pose
+
+# Of the first frame's steps so many come before the next frame may be tracked; the following
+# frames make up for the rest, so many steps each.
+FIRST_STEPS_SHARE = 0.4
+MADE_UP_A_FRAME = 40
+
+# A new keyframe: its number, its images and its sample of rays, camera frame.
+NewKeyframe = tuple[int, RgbdFrame, Rays]
+
+
+class FrameTraining:
+    """Trains the regions about the camera with one frame after the other, in a thread of its own.
+
+    From `start` to `wait` regions and keyframes belong to that thread.
+
+    Args:
+        config: of mapping, and of what links keyframes.
+        atlas: tells which regions are trained.
+        optimizer: trains them.
+        scratch: where the keyframes' images lie.
+        frames_wait: whether frames wait to be tracked. While they do, training gives way: it ends
+            after `mapping.min_iterations` steps.
+
+    Attributes:
+        latest: what the latest training did that was waited for.
+        recogniser: asks regions that woke, where loops are closed.
+    """
+
+    def __init__(
+        self,
+        config: MeslamConfig,
+        atlas: RegionAtlas,
+        optimizer: JointOptimizer,
+        scratch: ScratchFile,
+        frames_wait: Callable[[], bool],
+    ) -> None:
+        self.latest = Training()
+        self.recogniser: RegionRecogniser | None = None
+        self._config = config.mapping
+        self._atlas = atlas
+        self._keyframes = atlas.keyframes
+        self._optimizer = optimizer
+        self._frames_wait = frames_wait
+        self._worker = TrainingWorker()
+        self._trained: list[Region] = []
+        self._steps_owed = 0
+        self._turn = 0
+        self._linker: CovisibilityLinker | None = None
+        if config.keyframes.links:
+            self._linker = CovisibilityLinker(self._keyframes, config, scratch)
+            if config.regions.close_loops:
+                self.recogniser = RegionRecogniser(atlas, self._linker)
+
+    def start_first(self) -> None:
+        """Begin to train the first region from nothing, with the first keyframe."""
+        self._trained = [self._atlas.working]
+        self._steps_owed = self._config.first_iterations
+        self._worker.start(self._train_first)
+
+    def start(self, current: Rays, T_map_current: Pose, keyframe: NewKeyframe | None) -> None:
+        """Begin to train with a frame.
+
+        Args:
+            current: rays of the frame, camera frame.
+            T_map_current: (4, 4) its pose.
+            keyframe: what it is as a keyframe, where it is one.
+        """
+        config = self._config
+        steps = config.iterations if keyframe is None else config.keyframe_iterations
+        steps += min(self._steps_owed, MADE_UP_A_FRAME)
+        self._trained = self._next_to_train()
+        self._worker.start(
+            partial(self._train, self._trained, steps, current, T_map_current, keyframe)
+        )
+
+    def wait(self) -> bool:
+        """Wait for the training that runs; whether one did. Raises what the training raised."""
+        trained = self._worker.wait()
+        if trained is None:
+            return False
+        for region in self._trained:
+            region.version += 1
+        if self._steps_owed:
+            self._steps_owed = max(0, self._steps_owed - trained.losses.steps)
+        self.latest = trained
+        return True
+
+    def _next_to_train(self) -> list[Region]:
+        """The working region, and in turn one of the others that contain the camera.
+
+        So a frame costs the same at a corner, where eight regions meet, as between two.
+        """
+        others = [region for region in self._atlas.training if region.confirmed]
+        self._turn += 1
+        return [self._atlas.working, *(others[self._turn % len(others)] for _ in others[:1])]
+
+    def _train(
+        self,
+        regions: list[Region],
+        steps: int,
+        current: Rays,
+        pose: Pose,
+        keyframe: NewKeyframe | None,
+    ) -> Training:
+        """Train the working region, which comes first, and the other one half as long."""
+        started = time.perf_counter()
+        self._atlas.settle()
+        if keyframe is not None and self._register(keyframe):
+            pose = self._keyframes.pose(keyframe[0])
+        least = self._config.min_iterations
+        losses = self._optimizer.train(
+            regions[0], steps, current, pose, enough=partial(self._may_end, least)
+        )
+        for region in regions[1:]:
+            self._optimizer.train(
+                region,
+                steps // 2,
+                current,
+                pose,
+                refine_poses=False,
+                enough=partial(self._may_end, least // 2),
+            )
+        return Training(losses, (time.perf_counter() - started) * 1e3)
+
+    def _train_first(self) -> Training:
+        started = time.perf_counter()
+        least = math.ceil(FIRST_STEPS_SHARE * self._steps_owed)
+        losses = self._optimizer.train(
+            self._atlas.working,
+            self._steps_owed,
+            refine_poses=False,
+            enough=partial(self._may_end, least),
+        )
+        return Training(losses, (time.perf_counter() - started) * 1e3)
+
+    def _register(self, keyframe: NewKeyframe) -> bool:
+        """Tie a new keyframe to older ones; whether that corrected the path it is on."""
+        if self._linker is None:
+            return False
+        for link in self._linker.link(*keyframe, self._frames_wait):
+            self._keyframes.add_link(link.first, link.second, link.T_first_second)
+        if self.recogniser is None:
+            return False
+        corrections = self.recogniser.corrections
+        for region in self._atlas.doubtful[:1]:
+            self.recogniser.ask(region, *keyframe)
+        return self.recogniser.corrections > corrections
+
+    def _may_end(self, least: int, done: int) -> bool:
+        return done >= least and self._frames_wait()

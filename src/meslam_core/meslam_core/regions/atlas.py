@@ -10,17 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meslam_core.config import MeslamConfig
-from meslam_core.field import make_field
-from meslam_core.field.network import shifted
 from meslam_core.loop.pose_graph import rigid_motion
 from meslam_core.mapping.keyframes import KeyframeStore
 from meslam_core.regions.grid import RegionGrid, RegionIndex
-from meslam_core.regions.observed_mask import ObservedMask
+from meslam_core.regions.inheritance import first_region, region_beside
 from meslam_core.regions.region import Region
+from meslam_core.regions.region_keyframes import RegionKeyframes
 from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import inverse, orthonormalized
 
-MIN_VISIBLE_SHARE = 0.1
 # Regions whose boxes are so near are awake, though not in training: entering costs nothing then,
 # and a camera that sways at a box's border does not wake and rest it every time [m].
 NEAR_M = 0.3
@@ -65,6 +63,7 @@ class RegionAtlas:
         self.grid = RegionGrid.around(position, config.regions)
         self.keyframes = keyframes
         self._seed = seed
+        self._views = RegionKeyframes(keyframes)
         self._recognises = config.regions.close_loops and config.keyframes.links > 0
         self._scratch = scratch
         self.regions: dict[RegionIndex, Region] = {}
@@ -72,9 +71,7 @@ class RegionAtlas:
         self._training: list[RegionIndex] = []
         self._near: list[RegionIndex] = []
         self._awake: list[Region] = []
-        T_map_region = np.eye(4)
-        T_map_region[:3, 3] = self.grid.center(self._working)
-        self.regions[self._working] = self._new_region(self._working, T_map_region)
+        self.regions[self._working] = first_region(self._working, self.grid, config, seed)
 
     def take_over(
         self, grid: RegionGrid, regions: Iterable[Region], position: NDArray[np.floating]
@@ -176,16 +173,10 @@ class RegionAtlas:
         self._awake = kept
         for region in kept:
             if region.confirmed:
-                self._meet(region)
+                self._views.meet(region)
         wanted = [k for region in reversed(kept) for k in region.keyframes]
         self.keyframes.storage.hold(wanted, READ_A_FRAME)
-        left = MARKED_A_FRAME
-        for region in kept:
-            portion = region.unmarked[:left]
-            for keyframe in portion:
-                self.observe(region, keyframe)
-            del region.unmarked[: len(portion)]
-            left -= len(portion)
+        self._views.mark(kept, MARKED_A_FRAME)
 
     @property
     def doubtful(self) -> list[Region]:
@@ -210,7 +201,7 @@ class RegionAtlas:
         """One region with all its keyframes in memory, for work that goes region by region."""
         region.wake()
         self._rest_except([region, *self.active])
-        self._meet(region)
+        self._views.meet(region)
         self.keyframes.storage.hold(region.keyframes, len(region.keyframes))
         yield region
 
@@ -220,98 +211,25 @@ class RegionAtlas:
             if not region.confirmed and region is not self.working:
                 continue
             region.keyframes.append(keyframe)
-            self.observe(region, keyframe)
-
-    def observe(self, region: Region, keyframe: int) -> None:
-        """Mark in a region's mask what a keyframe saw."""
-        rays = self.keyframes.all_rays(keyframe)
-        T_region_camera = inverse(region.T_map_region) @ self.keyframes.pose(keyframe)
-        directions = rays.directions.cpu().numpy() @ T_region_camera[:3, :3].T.astype(np.float32)
-        region.mask.integrate(
-            T_region_camera[:3, 3],
-            directions,
-            rays.distances_m.cpu().numpy(),
-            region.field_config.truncation_m,
-        )
+            self._views.observe(region, keyframe)
 
     def rebuild_mask(self, region: Region) -> bool:
         """Mark the observed space anew from the refined keyframe poses; whether it changed."""
-        before = region.mask.flags.copy()
-        if region.origin is None:
-            region.mask.clear()
-        for keyframe in region.keyframes:
-            self.observe(region, keyframe)
-        region.unmarked.clear()
-        return not np.array_equal(region.mask.flags, before)
+        return self._views.rebuild_mask(region)
 
     def _on_lattice(self, position: NDArray[np.floating]) -> NDArray[np.float64]:
         """Where a position (3,) would be if no correction had moved the working region [m]."""
         local = inverse(self.working.T_map_region) @ np.append(position, 1.0)
         return np.asarray(self.grid.center(self._working) + local[:3], np.float64)
 
-    def _new_region(self, index: RegionIndex, T_map_region: NDArray[np.float64]) -> Region:
-        extent = self.config.regions.mask_extent * 0.5 * self.grid.side_m
-        return Region(
-            index=index,
-            T_map_region=T_map_region,
-            side_m=self.grid.side_m,
-            field=make_field(self.config.field, self._seed),
-            mask=ObservedMask(extent, self.config.regions.mask_voxel_m),
-        )
-
     def _neighbour(self, index: RegionIndex) -> Region:
         """A new region that continues the working region's map, and its replay."""
         parent = self.working
         parent.wake()
-        steps = self.grid.center(index) - self.grid.center(parent.index)
-        T_map_region = parent.T_map_region.copy()
-        T_map_region[:3, 3] += T_map_region[:3, :3] @ steps
-        region = self._new_region(index, T_map_region)
-        self._initialise(region, parent, steps)
-        region.keyframes = self._seeing(region, range(len(self.keyframes)))
-        region.keyframes = region.keyframes or parent.keyframes[-1:]
-        region.seen = len(self.keyframes)
-        known = set() if self.config.regions.initialisation == "random" else set(parent.keyframes)
-        region.unmarked = [k for k in region.keyframes if k not in known]
+        region = region_beside(parent, index, self.grid, self.config, self._seed)
+        inherited = self.config.regions.initialisation != "random"
+        self._views.assign(region, parent, observed_alike=inherited)
         return region
-
-    def _initialise(self, region: Region, parent: Region, steps: NDArray[np.float64]) -> None:
-        """The network of a region whose centre lies `steps` (3,) from its parent's [m]."""
-        how = self.config.regions.initialisation
-        if how == "random":
-            return
-        weights = parent.field.flat()
-        if how == "continued":
-            offset = steps / parent.half_side_m
-            weights = shifted(weights, self.config.field.embedding, offset)
-        # The network answers as the parent's does, so it has seen as much.
-        region.mask.flags[:] = parent.mask.moved(steps).flags
-        region.field.load_flat(weights)
-        region.field.load_optimizer_state(*parent.field.optimizer_state())
-
-    def _meet(self, region: Region) -> None:
-        """Give a region the keyframes that saw it while it was at rest."""
-        count = len(self.keyframes)
-        if region.seen < count:
-            known = set(region.keyframes)
-            found = self._seeing(region, range(region.seen, count))
-            found = [k for k in found if k not in known]
-            if found:
-                region.unmarked += found
-                region.keyframes = sorted([*region.keyframes, *found])
-            region.seen = count
-
-    def _seeing(self, region: Region, keyframes: Iterable[int]) -> list[int]:
-        """Those keyframes that were taken in a region's box or see a good part of it."""
-        numbers = np.array(list(keyframes), np.int64)
-        if not len(numbers):
-            return []
-        T = inverse(region.T_map_region)
-        positions = self.keyframes.pose_arrays()[1][numbers] @ T[:3, :3].T + T[:3, 3]
-        inside = (np.abs(positions) < region.half_side_m).all(axis=1)
-        points = self.keyframes.points(numbers) @ T[:3, :3].T + T[:3, 3]
-        seen = (np.abs(points) < region.half_side_m).all(axis=2).mean(axis=1)
-        return [int(k) for k in numbers[inside | (seen > MIN_VISIBLE_SHARE)]]
 
     def _wake(self, region: Region) -> None:
         region.wake()

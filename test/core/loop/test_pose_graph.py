@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from meslam_core.loop.pose_graph import MeasuredMotion, optimised_poses, rigid_motion
-from meslam_core.mapping.keyframe_links import KeyframeLinks
+from meslam_core.loop.pose_graph import optimised_poses, rigid_motion
+from meslam_core.mapping.keyframe_links import KeyframeLinks, MeasuredMotion
 from meslam_core.se3 import exp, inverse, log
 
 COUNT = 120

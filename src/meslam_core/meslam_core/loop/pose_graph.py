@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from meslam_core.mapping.keyframe_links import LINK_OUTLIER, KeyframeLinks
+from meslam_core.mapping.keyframe_links import LINK_OUTLIER, KeyframeLinks, MeasuredMotion
 from meslam_core.se3 import Pose, inverse, orthonormalized
 
 Floats = NDArray[np.float64]
@@ -21,20 +20,6 @@ KEPT_WEIGHT = 0.01
 FIXED_SIGMA = 1e-6
 
 
-@dataclass(frozen=True)
-class MeasuredMotion:
-    """A motion that is believed however little it agrees with the poses so far.
-
-    Attributes:
-        first, second: numbers of two keyframes.
-        T_first_second: (4, 4), the second's camera coordinates to the first's.
-    """
-
-    first: int
-    second: int
-    T_first_second: Pose
-
-
 def optimised_poses(poses: Floats, links: KeyframeLinks, loops: Sequence[MeasuredMotion]) -> Floats:
     """The poses that agree best with all measured motions; the first one stays.
 
@@ -44,7 +29,8 @@ def optimised_poses(poses: Floats, links: KeyframeLinks, loops: Sequence[Measure
     Args:
         poses: (K, 4, 4) T_map_camera.
         links: between keyframes.
-        loops: motions between keyframes that were recognised.
+        loops: between keyframes that were recognised; believed however little they agree with
+            the poses so far.
     """
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for number, pose in enumerate(poses):

@@ -7,8 +7,9 @@ import logging
 import numpy as np
 
 from meslam_core.frame import RgbdFrame
-from meslam_core.loop.pose_graph import MeasuredMotion, optimised_poses
-from meslam_core.mapping.covisibility import CovisibilityLink, CovisibilityLinker
+from meslam_core.loop.pose_graph import optimised_poses
+from meslam_core.mapping.covisibility import CovisibilityLinker
+from meslam_core.mapping.keyframe_links import MeasuredMotion
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.regions.region import Region
@@ -62,7 +63,7 @@ class RegionRecogniser:
             self._believe(links)
             region.confirmed = True
 
-    def _believe(self, links: list[CovisibilityLink]) -> None:
+    def _believe(self, links: list[MeasuredMotion]) -> None:
         keyframes = self._keyframes
         # The last one agreed with the others.
         link = links[-1]
@@ -70,9 +71,8 @@ class RegionRecogniser:
         apart = inverse(keyframes.pose(link.second)) @ found
         far = float(np.linalg.norm(apart[:3, 3]))
         if far > TOLERATED_M or rotation_angle(apart) > TOLERATED_RAD:
-            loops = [MeasuredMotion(k.first, k.second, k.T_first_second) for k in links]
             before = keyframes.poses()
-            after = optimised_poses(before, keyframes.links, loops)
+            after = optimised_poses(before, keyframes.links, links)
             everyone = np.arange(1, len(after))
             keyframes.set_poses(
                 everyone,

@@ -7,7 +7,7 @@ again what an older one saw is registered with it directly.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
@@ -18,6 +18,7 @@ from meslam_core.camera import PinholeCamera
 from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.mapping.keyframe_images import KeyframeImage, KeyframeImages
+from meslam_core.mapping.keyframe_links import MeasuredMotion
 from meslam_core.mapping.keyframes import KeyframeStore, Rays
 from meslam_core.odometry import make_registrar
 from meslam_core.scratch import ScratchFile
@@ -41,20 +42,6 @@ MIN_RECOGNISED_OVERLAP = 0.3
 # Recognised poses that agree within this are the same [m, rad].
 SAME_PLACE_M = 0.05
 SAME_PLACE_RAD = 0.02
-
-
-@dataclass(frozen=True)
-class CovisibilityLink:
-    """A measured motion: keyframe `second`'s camera coordinates to `first`'s.
-
-    Attributes:
-        first, second: numbers of the keyframes.
-        T_first_second: (4, 4).
-    """
-
-    first: int
-    second: int
-    T_first_second: Pose
 
 
 class CovisibilityLinker:
@@ -85,7 +72,7 @@ class CovisibilityLinker:
         frame: RgbdFrame,
         rays: Rays,
         frames_wait: Callable[[], bool] = lambda: False,
-    ) -> list[CovisibilityLink]:
+    ) -> list[MeasuredMotion]:
         """Register a new keyframe with up to `config.links` older ones.
 
         Args:
@@ -104,7 +91,7 @@ class CovisibilityLinker:
 
     def recognise(
         self, keyframe: int, frame: RgbdFrame, rays: Rays, among: Sequence[int]
-    ) -> list[CovisibilityLink]:
+    ) -> list[MeasuredMotion]:
         """Where a new keyframe is among older ones, however far off its pose is believed to be.
 
         Args:
@@ -119,13 +106,13 @@ class CovisibilityLinker:
         known = np.intersect1d(np.array(among, np.int64), self._images.numbers)
         overlaps = self._overlaps(keyframe, frame.camera, rays, known)
         prepared = self._registrar.prepare(KeyframeImage.of(frame, self._width).frame())
-        links: list[CovisibilityLink] = []
+        links: list[MeasuredMotion] = []
         shared = [k for k, overlap in overlaps if overlap > MIN_RECOGNISED_OVERLAP]
         for other in shared[:RECOGNITION_ATTEMPTS]:
             T_other_keyframe = self._search(other, keyframe, prepared)
             if T_other_keyframe is None:
                 continue
-            link = CovisibilityLink(other, keyframe, T_other_keyframe)
+            link = MeasuredMotion(other, keyframe, T_other_keyframe)
             alike = [each for each in links if self._agree(each, link)]
             if len(alike) + 1 >= RECOGNISING:
                 return [*alike, link]
@@ -148,7 +135,7 @@ class CovisibilityLinker:
             return None
         return best.T_target_source
 
-    def _agree(self, first: CovisibilityLink, second: CovisibilityLink) -> bool:
+    def _agree(self, first: MeasuredMotion, second: MeasuredMotion) -> bool:
         """Whether two links say the same of where the new keyframe is."""
         poses = [self._keyframes.pose(k.first) @ k.T_first_second for k in (first, second)]
         apart = inverse(poses[0]) @ poses[1]
@@ -161,15 +148,15 @@ class CovisibilityLinker:
         image: KeyframeImage,
         others: Iterable[int],
         frames_wait: Callable[[], bool] = lambda: False,
-    ) -> list[CovisibilityLink]:
-        links: list[CovisibilityLink] = []
+    ) -> list[MeasuredMotion]:
+        links: list[MeasuredMotion] = []
         prepared = self._registrar.prepare(image.frame())
         for attempt, other in enumerate(others):
             if len(links) >= self._links or (attempt >= LEAST_ATTEMPTS and frames_wait()):
                 break
             T_other_keyframe = self._register(other, keyframe, prepared)
             if T_other_keyframe is not None:
-                links.append(CovisibilityLink(other, keyframe, T_other_keyframe))
+                links.append(MeasuredMotion(other, keyframe, T_other_keyframe))
         return links
 
     def _register(self, older: int, keyframe: int, prepared: object) -> Pose | None:

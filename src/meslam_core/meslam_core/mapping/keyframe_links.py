@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,20 @@ LINK_OUTLIER = 0.03
 _NEXT, _AFTER_NEXT = np.array([1, 2, 0]), np.array([2, 0, 1])
 # Where a flattened matrix holds the entries of hat(w) that are w, and those that are -w.
 HAT_POSITIVE, HAT_NEGATIVE = np.array([7, 2, 3]), np.array([5, 6, 1])
+
+
+@dataclass(frozen=True)
+class MeasuredMotion:
+    """The motion between two keyframes as something measured it.
+
+    Attributes:
+        first, second: numbers of the keyframes.
+        T_first_second: (4, 4), the second's camera coordinates to the first's.
+    """
+
+    first: int
+    second: int
+    T_first_second: Pose
 
 
 class KeyframeLinks:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from data.analytic_scene import GRID, SIDE_M, SphereInRoom, learnt_field, stored
 from meslam_core.config import FieldConfig
 from meslam_core.field import make_field
 from meslam_core.map.neural_map import NeuralMap
+from meslam_core.map.store import MapStore
 from meslam_core.map.stored_region import Architecture, StoredRegion
 from meslam_core.regions.observed_mask import ObservedMask
 
@@ -68,3 +70,11 @@ def two_small_regions(small_region: StoredRegion) -> list[StoredRegion]:
         T_map_region[:3, 3] = GRID.center(index)
         regions.append(replace(small_region, index=index, T_map_region=T_map_region))
     return regions
+
+
+@pytest.fixture
+def saved(tmp_path: Path, two_small_regions: list[StoredRegion]) -> MapStore:
+    """A map of two regions."""
+    store = MapStore(tmp_path / "flat.meslam")
+    store.save(two_small_regions, GRID)
+    return store

@@ -116,3 +116,29 @@ def test_a_view_that_a_region_does_not_know_moves_nothing_and_is_asked_about_les
     assert not region.confirmed
     assert walk.recogniser.corrections == 0
     assert asked == [*range(1, MANY_DOUBTS + 1), MANY_DOUBTS + THEN_EVERY]
+
+
+def test_a_region_whose_views_lie_elsewhere_is_asked_until_the_camera_comes_to_them():
+    walk = Walk()
+    for pose in POSES:
+        walk.atlas.add_keyframe(walk.add(pose, pose)[0])
+    region = walk.atlas.working
+    region.confirmed, region.known_until = False, len(POSES)
+    away = POSES[0] @ exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(180.0), 0.0]))
+    walk.recogniser.ask(region, *walk.add(away, away, linked=False))
+    assert not region.confirmed
+    assert region.doubts == 0
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 24.0])
+def test_a_view_that_shares_little_with_those_of_a_region_is_recognised(turn_deg):
+    walk = Walk()
+    for pose in POSES:
+        walk.atlas.add_keyframe(walk.add(pose, pose)[0])
+    region = walk.atlas.working
+    region.confirmed, region.known_until = False, len(POSES)
+    back = POSES[0] @ exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(-turn_deg), 0.0]))
+    latest = walk.add(back, DRIFT @ back, linked=False)
+    walk.recogniser.ask(region, *latest)
+    assert region.confirmed
+    assert np.linalg.norm(log(inverse(back) @ walk.keyframes.pose(latest[0]))[:3]) < 0.02

@@ -59,6 +59,10 @@ class RegionRecogniser:
         if region.doubts > MANY_DOUBTS and region.doubts % THEN_EVERY:
             return
         links = self._linker.recognise(keyframe, frame, rays, range(region.known_until))
+        if links is None:
+            # The camera has yet to come to what was seen.
+            region.doubts -= 1
+            return
         if links:
             self._believe(links)
             region.confirmed = True

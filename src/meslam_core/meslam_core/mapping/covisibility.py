@@ -39,6 +39,9 @@ MAX_CORRECTION_RAD = 0.25
 RECOGNISING = 2
 RECOGNITION_ATTEMPTS = 4
 MIN_RECOGNISED_OVERLAP = 0.3
+# They may share little of the view; where they meet, nearly all of it then has to look alike.
+MIN_RECOGNISED_FITNESS = 0.3
+MIN_LIKENESS = 0.95
 # Recognised poses that agree within this are the same [m, rad].
 SAME_PLACE_M = 0.05
 SAME_PLACE_RAD = 0.02
@@ -91,7 +94,7 @@ class CovisibilityLinker:
 
     def recognise(
         self, keyframe: int, frame: RgbdFrame, rays: Rays, among: Sequence[int]
-    ) -> list[MeasuredMotion]:
+    ) -> list[MeasuredMotion] | None:
         """Where a new keyframe is among older ones, however far off its pose is believed to be.
 
         Args:
@@ -101,13 +104,16 @@ class CovisibilityLinker:
             among: older keyframes.
 
         Returns:
-            Links that agree with each other; none where the place is not recognised for certain.
+            Links that agree with each other; none where the place is not recognised for certain,
+            and None where no older keyframe can have seen it.
         """
         known = np.intersect1d(np.array(among, np.int64), self._images.numbers)
         overlaps = self._overlaps(keyframe, frame.camera, rays, known)
+        shared = [k for k, overlap in overlaps if overlap > MIN_RECOGNISED_OVERLAP]
+        if not shared:
+            return None
         prepared = self._registrar.prepare(KeyframeImage.of(frame, self._width).frame())
         links: list[MeasuredMotion] = []
-        shared = [k for k, overlap in overlaps if overlap > MIN_RECOGNISED_OVERLAP]
         for other in shared[:RECOGNITION_ATTEMPTS]:
             T_other_keyframe = self._search(other, keyframe, prepared)
             if T_other_keyframe is None:
@@ -131,9 +137,13 @@ class CovisibilityLinker:
                     best = found
         except RuntimeError:
             return None
-        if best is None or best.fitness < MIN_FITNESS or best.agreement < MIN_AGREEMENT:
+        if best is None:
             return None
-        return best.T_target_source
+        fits = best.fitness >= MIN_FITNESS and best.agreement >= MIN_AGREEMENT
+        alike = best.agreement >= MIN_LIKENESS * best.fitness
+        if fits or (best.fitness >= MIN_RECOGNISED_FITNESS and alike):
+            return best.T_target_source
+        return None
 
     def _agree(self, first: MeasuredMotion, second: MeasuredMotion) -> bool:
         """Whether two links say the same of where the new keyframe is."""

@@ -127,9 +127,9 @@ def verdicts(rows: Sequence[Row]) -> list[str]:
 
 
 def _loss(stored: dict[str, float], exact: dict[str, float]) -> float:
-    """The largest relative loss of accuracy, completion or the completed share."""
+    """The largest relative loss of accuracy, completion or the completed share; 0 for none."""
     worse = [stored[name] / exact[name] - 1.0 for name in stored if name.endswith("_m")]
-    return max(*worse, 1.0 - stored["completion_ratio"] / exact["completion_ratio"])
+    return max(0.0, *worse, 1.0 - stored["completion_ratio"] / exact["completion_ratio"])
 
 
 def _verdict(said: str, holds: bool) -> str:

@@ -295,6 +295,25 @@ def test_a_keyframe_that_saw_a_region_at_rest_is_replayed_when_it_wakes(resting)
     assert resting.regions[(0, 0, 0)].mask.observed_volume_m3 > seen_before
 
 
+def test_a_region_that_was_not_recognised_waits_until_the_map_beside_it_ends(resting):
+    for step in (0.45, 1.2, 0.55, 0.45):
+        far(resting, at(step))
+    assert not resting.regions[(0, 0, 0)].confirmed
+    # The camera has left the working region's box, but not what it has seen.
+    far(resting, at(0.2))
+    assert resting.working.index == (1, 0, 0)
+    far(resting, at(-0.1))
+    assert resting.working.index == (0, 0, 0)
+
+
+def test_a_region_that_was_recognised_takes_over_at_once(resting):
+    for step in (0.45, 1.2, 0.55):
+        far(resting, at(step))
+    resting.regions[(0, 0, 0)].confirmed = True
+    far(resting, at(0.4))
+    assert resting.working.index == (0, 0, 0)
+
+
 def test_a_region_that_was_moved_has_its_neighbours_beside_it(atlas):
     motion = exp(np.array([0.3, -0.1, 0.05, 0.02, -0.05, 0.3]))
     atlas.working.T_map_region = motion @ atlas.working.T_map_region

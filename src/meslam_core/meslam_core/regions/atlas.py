@@ -22,6 +22,8 @@ from meslam_core.se3 import inverse, orthonormalized
 # Regions whose boxes are so near are awake, though not in training: entering costs nothing then,
 # and a camera that sways at a box's border does not wake and rest it every time [m].
 NEAR_M = 0.3
+# A region works so many half-sides from its centre while the next one has not been recognised.
+PATIENCE = 1.6
 # Work that regions bring with them is spread over frames: keyframes read from disk, and views
 # marked in masks, at most so many a frame.
 READ_A_FRAME = 24
@@ -129,18 +131,20 @@ class RegionAtlas:
         """The region that is to work for a camera past the middle of the working one's box.
 
         The nearest one, if it is so by enough. One that the camera has not been recognised in has
-        to wait, as long as the working region contains the camera.
+        to wait until the working region's map ends: what is trained where the camera is believed
+        to be would spoil it.
         """
         working = self.working.off_center_m(position)
-        leaving = working > self._half
-        found = [
-            (self._off_center(index, position), index)
-            for index in self._about(on_lattice)
-            if index != self._working and (leaving or self.regions[index].confirmed)
-        ]
+        others = {i: self._off_center(i, position) for i in self._about(on_lattice)}
+        others.pop(self._working, None)
+        waiting = []
+        if working < PATIENCE * self._half:
+            waiting = [i for i in others if not self.regions[i].confirmed]
+        found = [(others[i], i) for i in others if i not in waiting]
         distance, nearest = min(found, default=(np.inf, self._working))
-        if leaving and distance > self._half:
-            return self.grid.nearest(on_lattice)
+        if working > self._half and distance > self._half:
+            patient = any(others[i] < self._half for i in waiting)
+            return self._working if patient else self.grid.nearest(on_lattice)
         if distance < working - 2.0 * self.config.regions.hysteresis_m:
             return nearest
         return self._working

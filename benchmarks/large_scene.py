@@ -196,7 +196,7 @@ def evaluated(job: Job, scene: Scene) -> tuple[dict[str, Any], Path2d]:
         "map_bytes": report["map_bytes"],
         "memory": memory_over_path(notes["peak_mb"], along_m),
         "refined_mb": report["refined_mb"],
-        "peak_rss_mb": report["peak_rss_mb"],
+        "peak_mb": report["peak_mb"],
         "settings": list(METHODS[job.method].settings),
         "preset": METHODS[job.method].preset,
         "along_path": _thinned(notes, along_m, online.errors_m, refined.errors_m),

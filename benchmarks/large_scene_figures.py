@@ -126,7 +126,7 @@ def _memory_and_time(summary: Mapping[str, Mapping[str, Any]], names: Mapping[st
             f"{memory['third_mb']:.0f}",
             f"{memory['end_mb']:.0f}",
             f"{memory['growth']:+.1%}",
-            f"{figures['peak_rss_mb']:.0f}",
+            f"{figures['peak_mb']:.0f}",
             f"{figures['map_bytes'] / 1e3:.0f}",
         )
     return table

@@ -122,12 +122,12 @@ class Measured:
         visits: of the regions; empty for one network.
         online_s: until the last frame was mapped, without the measurements [s].
         refined_s: the same until the map was refined [s].
-        refined_mb: memory after that [MB].
+        refined_mb, peak_mb: memory after that, and the most so far [MB].
     """
 
     def __init__(self, path: Path, config: MeslamConfig, seed: int) -> None:
         self.notes: list[FrameNote] = []
-        self.online_s = self.refined_s = self.refined_mb = 0.0
+        self.online_s = self.refined_s = self.refined_mb = self.peak_mb = 0.0
         self.tally = Tally()
         self.slam = Slam(config, seed)
         self._path = path
@@ -154,7 +154,7 @@ class Measured:
         self.online_s = time.perf_counter() - started
         self.slam.finish()
         self.refined_s = time.perf_counter() - started
-        self.refined_mb = memory_mb(os.getpid())[0]
+        self.refined_mb, self.peak_mb = memory_mb(os.getpid())
 
     def _note(self, result: FrameResult, wall_s: float) -> None:
         regions = self.slam.atlas.regions.values() if self.slam.atlas else ()
@@ -203,6 +203,7 @@ class Measured:
             "fps": self.tally.frames / self.online_s,
             "corrections": recogniser.corrections if recogniser else 0,
             "refined_mb": self.refined_mb,
+            "peak_mb": self.peak_mb,
             "config": self._config.to_mapping(),
             "visits": [_without_nan(asdict(visit)) for visit in self.visits.visits],
             **run_environment(),

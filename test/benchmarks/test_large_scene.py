@@ -129,7 +129,7 @@ def test_one_network_has_no_seams_and_still_its_rows():
         "online_s": 1.0,
         "wall_s": 2.0,
         "memory": {"third_mb": 100.0, "end_mb": 101.0, "growth": 0.01},
-        "peak_rss_mb": 120.0,
+        "peak_mb": 120.0,
         "map_bytes": 1000,
         "revisits": [],
     }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -24,11 +22,6 @@ class Training:
     duration_ms: float = 0.0
 
 
-def _give_way() -> None:
-    """Where threads compete for a core, tracking and odometry come before the calling one."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
-
-
 class TrainingWorker:
     """Runs one job at a time; the caller goes on meanwhile and takes the result when it wants to.
 
@@ -37,9 +30,7 @@ class TrainingWorker:
     """
 
     def __init__(self) -> None:
-        self._threads = ThreadPoolExecutor(
-            max_workers=1, thread_name_prefix="meslam-mapping", initializer=_give_way
-        )
+        self._threads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="meslam-mapping")
         self._running: Future[Training] | None = None
 
     def start(self, job: Callable[[], Training]) -> None:

@@ -109,11 +109,9 @@ def verdicts(rows: Sequence[Row]) -> list[str]:
     accuracy_m = max(each.error["accuracy_median_m"] for each in stored)
     pairs = list(zip(stored, exact, strict=True))
     loss = max(_loss(a.error, b.error) for a, b in pairs)
-    return [
+    lines = [
         _verdict(f"largest stored map: {_megabytes(max(sizes))} MB", max(sizes) <= MOST_BYTES)
         + f" of {_megabytes(int(MOST_BYTES))} MB",
-        _verdict(f"sizes differ by {100 * growth:.1f} %", growth <= MOST_GROWTH)
-        + f" of {100 * MOST_GROWTH:g} %",
         _verdict(f"least within 5 cm: {100 * ratio:.1f} %", ratio >= LEAST_COMPLETION)
         + f" of {100 * LEAST_COMPLETION:g} %",
         _verdict(
@@ -124,6 +122,12 @@ def verdicts(rows: Sequence[Row]) -> list[str]:
         _verdict(f"int8 is at most {100 * loss:.1f} % worse than fp32", loss <= MOST_LOSS)
         + f" of {100 * MOST_LOSS:g} %",
     ]
+    if len(sizes) > 1:
+        lines.append(
+            _verdict(f"sizes differ by {100 * growth:.1f} %", growth <= MOST_GROWTH)
+            + f" of {100 * MOST_GROWTH:g} %"
+        )
+    return lines
 
 
 def _loss(stored: dict[str, float], exact: dict[str, float]) -> float:

@@ -65,6 +65,7 @@ LIBRARIES = ("open3d-cpu", "torch", "numpy")
 DURATIONS_S = (30.0, 60.0, 90.0, 120.0, 150.0)
 QUICK_S = (4.0, 8.0)
 FPS = 15
+METHODS = ("ours", "classics")
 PRECISIONS = ("fp32", "fp16", "int8")
 MESH_M = 0.02
 VOXELS_M = (0.01, 0.02)
@@ -246,12 +247,14 @@ def keep(path: Path, rows: Sequence[Row]) -> list[Row]:
 def collect(space: Space, options: argparse.Namespace) -> list[Row]:
     """All rows, those of finished parts from the cache."""
     rows: list[Row] = []
-    for seconds in options.durations:
+    for seconds in options.durations if "ours" in options.methods else ():
         path = folder_of(space, seconds) / "ours.json"
         if "ours" in options.again:
             shutil.rmtree(path.parent / "meslam", ignore_errors=True)
             path.unlink(missing_ok=True)
         rows += kept(path) or keep(path, our_rows(space, seconds, options.set))
+    if "classics" not in options.methods:
+        return rows
     paths = [folder_of(space, seconds) / "classics.json" for seconds in options.durations]
     if "classics" in options.again or not all(path.exists() for path in paths):
         for path, found in zip(paths, classic_rows(space, options.durations), strict=True):
@@ -263,7 +266,8 @@ def parsed_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--recording", type=Path, help="of the library; made if missing")
     parser.add_argument("--durations", type=float, nargs="+", default=list(DURATIONS_S))
-    parser.add_argument("--again", nargs="+", choices=("ours", "classics"), default=[])
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--again", nargs="+", choices=METHODS, default=[], help="make these anew")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     seconds = " and ".join(f"{each:g}" for each in QUICK_S)
     parser.add_argument("--quick", action="store_true", help=f"{seconds} s of a short recording")

@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -599,7 +600,8 @@ def main() -> None:
     stem = options.out / "map_quality"
     described = machine(LIBRARIES)
     with stem.with_suffix(".txt").open("w") as file:
-        file.write("Made by `python benchmarks/map_quality.py`, on one thread\n\n")
+        command = " ".join(["python", "benchmarks/map_quality.py", *sys.argv[1:]])
+        file.write(f"Made by `{command}`, on one thread\n\n")
         file.write(f"{machine_line(described)}\n\n")
         Console(file=file, width=150).print(table_of(found))
         for each in found:

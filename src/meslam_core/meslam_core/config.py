@@ -249,7 +249,7 @@ class KeyframesConfig:
     rays: int = setting(8192, "pixels kept of a keyframe for training", minimum=256, maximum=200000)
     ray_budget: int = setting(
         128 * 8192,
-        "pixels kept of all keyframes; with more keyframes each keeps fewer",
+        "pixels in memory of all keyframes; of more keyframes fewer each",
         unit="rays",
         minimum=4096,
         maximum=1_000_000_000,

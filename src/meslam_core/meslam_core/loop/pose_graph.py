@@ -81,11 +81,11 @@ def _pose3(pose: Pose) -> gtsam.Pose3:
 def _between(
     first: int, second: int, motion: Pose, weight: float, robust: bool = False
 ) -> gtsam.BetweenFactorPose3:
-    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Precision(6, max(weight, 1e-9))
+    # A link of no weight would be an infinite deviation.
+    precision = max(weight, 1e-9)
+    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Precision(6, precision)
     if robust:
         # GTSAM's threshold is for residuals divided by their deviation.
-        loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(
-            LINK_OUTLIER * max(weight, 1e-9) ** 0.5
-        )
+        loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(LINK_OUTLIER * precision**0.5)
         noise = gtsam.noiseModel.Robust.Create(loss, noise)
     return gtsam.BetweenFactorPose3(first, second, _pose3(motion), noise)

@@ -30,7 +30,7 @@ class RegionRecogniser:
     """Asks regions that woke whether they know the view, and corrects the path by the answer.
 
     Until then such a region is not trained, what does not agree with its map would spoil it, and
-    the region before goes on working as long as it contains the camera.
+    the region before goes on working as far as its map reaches.
 
     Args:
         atlas: its regions are moved by corrections.

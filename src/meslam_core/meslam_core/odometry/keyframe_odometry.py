@@ -26,6 +26,9 @@ UNKNOWN_VARIANCE = 1.0
 # Within such a motion between two frames the alignment finds the right answer from any guess.
 SAFE_MOTION_M = 0.04
 SAFE_TURN_RAD = 0.05
+# So much a faster motion may differ from its prediction before other answers are looked for.
+EXPECTED_MOTION_M = 0.01
+EXPECTED_TURN_RAD = 0.0125
 # A registration that starts so near to where another one ended ends there, too. Wider limits
 # (2 cm) would miss better results along plain walls.
 SAME_MOTION_M = 0.006
@@ -91,7 +94,7 @@ class KeyframeOdometry:
     def _register(self, prepared: Any, guess: Pose, elapsed_s: float) -> tuple[Registration, str]:
         """Register against the keyframe, harder where that is doubtful; why it is invalid."""
         best = self._attempt(prepared, self._keyframe, self._T_odom_keyframe, guess)
-        if not self._fits(best) or self._is_fast(best, guess):
+        if not self._fits(best) or self._is_surprising(best, guess):
             found = [best]
             for target, T_odom_target, start, searched in self._other_starts(prepared, guess):
                 T_keyframe_start = inverse(self._T_odom_keyframe) @ start
@@ -109,20 +112,20 @@ class KeyframeOdometry:
     def _leads_to(self, T_keyframe_start: Pose, result: Registration) -> bool:
         """Whether a registration that starts there would only end where another one did."""
         apart = inverse(T_keyframe_start) @ result.T_target_source
-        near = float(np.linalg.norm(apart[:3, 3])) < SAME_MOTION_M
-        return (
-            near
-            and rotation_angle(apart) < SAME_TURN_RAD
-            and result.fitness >= self._config.min_fitness
+        return result.fitness >= self._config.min_fitness and not _exceeds(
+            apart, SAME_MOTION_M, SAME_TURN_RAD
         )
 
-    def _is_fast(self, result: Registration, guess: Pose) -> bool:
-        """Whether the motion is so fast that a result which fits may be a wrong one nearby."""
+    def _is_surprising(self, result: Registration, guess: Pose) -> bool:
+        """Whether the motion is such that a result which fits may be a wrong one nearby.
+
+        A fast motion is believed where it came as it was predicted.
+        """
         T_odom_camera = self._T_odom_keyframe @ result.T_target_source
-        return any(
-            np.linalg.norm(motion[:3, 3]) > SAFE_MOTION_M or rotation_angle(motion) > SAFE_TURN_RAD
-            for motion in (inverse(guess) @ T_odom_camera, inverse(self._T_odom_last) @ guess)
-        )
+        correction = inverse(guess) @ T_odom_camera
+        if _exceeds(inverse(self._T_odom_last) @ guess, SAFE_MOTION_M, SAFE_TURN_RAD):
+            return _exceeds(correction, EXPECTED_MOTION_M, EXPECTED_TURN_RAD)
+        return _exceeds(correction, SAFE_MOTION_M, SAFE_TURN_RAD)
 
     def _other_starts(self, prepared: Any, guess: Pose) -> Iterator[tuple[Any, Pose, Pose, bool]]:
         """Target, its pose, T_odom_camera to start from, and whether that took a search.
@@ -186,6 +189,10 @@ class KeyframeOdometry:
         moved = float(np.linalg.norm(offset[:3, 3])) > self._config.keyframe_translation_m
         turned = np.rad2deg(rotation_angle(offset)) > self._config.keyframe_rotation_deg
         return moved or turned or registration.fitness < self._config.good_fitness
+
+
+def _exceeds(motion: Pose, motion_m: float, turn_rad: float) -> bool:
+    return bool(np.linalg.norm(motion[:3, 3]) > motion_m or rotation_angle(motion) > turn_rad)
 
 
 def _covariance(registration: Registration, valid: bool) -> NDArray[np.float64]:

@@ -32,8 +32,8 @@ def table() -> str:
     """The table of all parameters of the nodes."""
     lines = [
         "",
-        "| node | parameter | default | unit | range | meaning |",
-        "|---|---|---|---|---|---|",
+        "| node | parameter | default | unit | range | changes | meaning |",
+        "|---|---|---|---|---|---|---|",
     ]
     for kind, nodes in NODES.items():
         for entry in entries_of(kind):
@@ -43,6 +43,7 @@ def table() -> str:
                 _default(entry),
                 entry.unit,
                 _range(entry),
+                "any time" if entry.live else "unconfigured",
                 entry.meaning,
             )
             lines.append("| " + " | ".join(cells) + " |")

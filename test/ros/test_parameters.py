@@ -1,19 +1,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import rclpy
-from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.msg import ParameterType, SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from meslam_core.config import MeslamConfig, settings
 from meslam_core.errors import ConfigError
 from meslam_ros import node_settings
-from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.managed_node import ManagedNode
+from meslam_ros.map_server_node import MapServerNode
+from meslam_ros.odometry_node import OdometryNode
+from meslam_ros.parameters import FIXED, LIVE, declare_config, declare_settings, read_config
 from meslam_ros.parameters import node_settings as entries_of
+from meslam_ros.region_manager_node import RegionManagerNode
+from meslam_ros.tracking_node import TrackingNode
 
 SECTIONS = list(MeslamConfig().to_mapping())
 KINDS = [
@@ -64,7 +71,7 @@ def test_every_setting_is_described_with_type_unit_range_and_meaning(node_with) 
         assert described.type == TYPES[type(entry.default)]
         assert entry.meaning in described.description
         assert entry.unit in described.description
-        assert described.read_only
+        assert FIXED in described.additional_constraints
         assert all(choice in described.additional_constraints for choice in entry.choices)
         ranges = [*described.floating_point_range, *described.integer_range]
         for bounds in ranges:
@@ -101,12 +108,78 @@ def test_unusable_values_are_refused_by_name(
     assert all(word in str(error.value) for word in words)
 
 
-def test_values_cannot_be_changed_behind_the_nodes_back(node_with) -> None:
+def test_live_settings_follow_their_parameters(node_with) -> None:
     node = node_with()
-    declare_settings(node, node_settings.TrackingSettings)
-    (result,) = node.set_parameters([Parameter("queue_size", value=3)])
+    current = declare_settings(node, node_settings.TrackingSettings)
+    results = node.set_parameters([Parameter("queue_size", value=3), Parameter("idle_s", value=2)])
+    assert all(result.successful for result in results)
+    assert (current.queue_size, current.idle_s) == (3, 2.0)
+    assert LIVE in node.describe_parameter("queue_size").additional_constraints
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("queue_size", 0, ("queue_size",)),
+        ("queue_size", "many", ("queue_size", "str", "int")),
+        ("idle_s", float("nan"), ("idle_s",)),
+        ("tracking.points", 2, ("tracking.points",)),
+    ],
+)
+def test_changes_are_checked_like_values_given_at_start(name, value, words, node_with) -> None:
+    node = node_with()
+    current = declare_settings(node, node_settings.TrackingSettings)
+    declare_config(node, SECTIONS)
+    before = replace(current)
+    (result,) = node.set_parameters([Parameter(name, value=value)])
     assert not result.successful
-    assert "read-only" in result.reason or "read only" in result.reason
+    assert all(word in result.reason for word in words), result.reason
+    assert current == before
+    assert read_config(node) == MeslamConfig()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        (TrackingNode, "mapping.iterations", 7),
+        (TrackingNode, "odom_frame", "wheels"),
+        (OdometryNode, "sensor.max_depth_m", 3.0),
+        (RegionManagerNode, "regions.overlap", 0.3),
+        (MapServerNode, "map_folder", "elsewhere"),
+    ],
+)
+def test_what_is_taken_at_configure_says_so_while_the_node_runs(
+    kind: type[ManagedNode], name: str, value: Any, start_node, client
+) -> None:
+    """Through the services that `ros2 param` uses."""
+    node = start_node(kind)
+
+    def change() -> SetParametersResult:
+        request = SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg()]
+        )
+        service = f"/{node.get_name()}/set_parameters"
+        return client.call(SetParameters, service, request).results[0]
+
+    refused = change()
+    assert not refused.successful
+    assert all(word in refused.reason for word in (name, f"/{node.get_name()}", "cleanup"))
+    node.trigger_deactivate()
+    assert not change().successful
+    node.trigger_cleanup()
+    assert change().successful
+    assert node.start()
+    assert node.get_parameter(name).value == value
+
+
+def test_configuration_is_read_anew_at_configure(start_node) -> None:
+    node = start_node(OdometryNode)
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    node.set_parameters([Parameter("odometry.method", value="none")])
+    assert not node.start()
+    node.set_parameters([Parameter("odometry.method", value="direct")])
+    assert node.start()
 
 
 def test_no_name_is_used_twice() -> None:

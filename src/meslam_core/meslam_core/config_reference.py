@@ -72,6 +72,10 @@ def reference() -> str:
         "`--ros-args -p section.name:=value`). A value of another type or outside its range is "
         "refused, and so is a name that does not exist.",
         "",
+        "A node takes these parameters when it is configured, for a map is trained by one set of "
+        "them; while it runs, a change is refused with the way to make it. The nodes' own "
+        "parameters, of which most change at any time, are in [interfaces.md](interfaces.md).",
+        "",
     ]
     for section, entries in _sections():
         lines += [f"## {section}", "", _purpose(section), ""]

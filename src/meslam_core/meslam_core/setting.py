@@ -19,14 +19,23 @@ def setting(
     minimum: float | None = None,
     maximum: float | None = None,
     choices: tuple[str, ...] = (),
+    live: bool = False,
 ) -> T:
-    """A dataclass field that carries its unit, range and meaning."""
+    """A dataclass field that carries its unit, range and meaning.
+
+    Args:
+        default: value, which tells the type too.
+        meaning: in a few words, for people.
+        unit, minimum, maximum, choices: what a value may be.
+        live: whether it may change while it is in use.
+    """
     metadata = {
         "meaning": meaning,
         "unit": unit,
         "minimum": minimum,
         "maximum": maximum,
         "choices": choices,
+        "live": live,
     }
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -43,6 +52,7 @@ class Setting:
     minimum: float | None
     maximum: float | None
     choices: tuple[str, ...]
+    live: bool = False
 
     @property
     def path(self) -> str:
@@ -58,6 +68,9 @@ class Setting:
         kind: Any = type(self.default)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
+        if kind is str and type(value) is int:
+            # ROS and YAML read a serial number or a folder named 2024 as a number.
+            value = str(value)
         if type(value) is not kind:
             raise ConfigError(
                 f"{self.path} = {value!r} is {type(value).__name__}, expected {kind.__name__}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -13,13 +14,13 @@ class FrameQueue(Generic[T]):
     """First in, first out; when full, the oldest entry gives way to the newest.
 
     Args:
-        size: entries that may wait.
+        size: tells how many entries may wait, now.
 
     Attributes:
         dropped: entries that gave way.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: Callable[[], int]) -> None:
         self.dropped = 0
         self._size = size
         self._entries: deque[T] = deque()
@@ -32,13 +33,13 @@ class FrameQueue(Generic[T]):
     def put(self, entry: T) -> bool:
         """Append an entry; False when another one had to give way."""
         with self._changed:
-            full = len(self._entries) >= self._size
-            if full:
+            before = self.dropped
+            while len(self._entries) >= self._size():
                 self._entries.popleft()
                 self.dropped += 1
             self._entries.append(entry)
             self._changed.notify()
-            return not full
+            return self.dropped == before
 
     def get(self, timeout_s: float) -> T | None:
         """The oldest entry; None when none came in time or the queue is closed."""

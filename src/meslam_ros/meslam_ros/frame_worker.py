@@ -6,6 +6,7 @@ import threading
 import time
 import traceback
 from collections import Counter
+from collections.abc import Callable
 from typing import Protocol
 
 from meslam_core.errors import FrameError, MeslamError
@@ -45,7 +46,7 @@ class FrameWorker:
     Args:
         node: whose executor listens; stopped when the consumer fails.
         settings, frames: of the input.
-        queue_size: image pairs that may wait.
+        queue_size: tells how many image pairs may wait.
         consumer: of the frames.
     """
 
@@ -54,7 +55,7 @@ class FrameWorker:
         node: ManagedNode,
         settings: InputSettings,
         frames: FrameSettings,
-        queue_size: int,
+        queue_size: Callable[[], int],
         consumer: FrameConsumer,
     ) -> None:
         self._node = node

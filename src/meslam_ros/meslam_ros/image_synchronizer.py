@@ -43,17 +43,20 @@ class ImageSynchronizer:
         tolerance_s: largest difference of stamps [s].
 
     Attributes:
+        tolerance_s: may change at any time [s].
         dropped: counts of images that found no partner, by reason.
     """
 
     def __init__(self, tolerance_s: float) -> None:
         self.dropped: Counter[str] = Counter()
-        self._tolerance_ns = round(tolerance_s * NANOSECONDS)
-        # No camera is so fast that its next image would be nearer.
-        self._equal_ns = self._tolerance_ns // 4
+        self.tolerance_s = tolerance_s
         self._color: list[tuple[int, Image]] = []
         self._depth: list[tuple[int, Image]] = []
         self._last_pair_ns: int | None = None
+
+    @property
+    def _tolerance_ns(self) -> int:
+        return round(self.tolerance_s * NANOSECONDS)
 
     def add_color(self, message: Image) -> Iterator[ImagePair]:
         """Take a colour image; yields the pairs that are complete now."""
@@ -96,7 +99,8 @@ class ImageSynchronizer:
             if nearest is None:
                 return None
             difference = abs(self._depth[nearest][0] - stamp)
-            certain = difference <= self._equal_ns or self._depth[-1][0] > stamp
+            # No camera is so fast that its next image would be nearer than a quarter.
+            certain = 4 * difference <= self._tolerance_ns or self._depth[-1][0] > stamp
             if difference <= self._tolerance_ns and certain:
                 return self._take(place, nearest)
             if not certain:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
@@ -21,6 +22,11 @@ from meslam_core.errors import MeslamError
 
 STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 USAGE_ERROR = 2
+AUTOSTART = ParameterDescriptor(
+    description="configure and activate at start, without waiting for a lifecycle manager",
+    additional_constraints="may be given at start alone",
+    read_only=True,
+)
 
 
 class ManagedNode(LifecycleNode):
@@ -29,6 +35,10 @@ class ManagedNode(LifecycleNode):
     Args:
         name: of the node.
         options: for `rclpy.node.Node`.
+
+    Attributes:
+        configured: whether it is configured or about to be: what it took then is in use.
+        ended: whether it was shut down.
     """
 
     exit_code = 0
@@ -37,7 +47,8 @@ class ManagedNode(LifecycleNode):
         super().__init__(name, **options)
         self.stop: Callable[[], None] = lambda: None
         self.ended = False
-        self.autostart = bool(self.declare_parameter("autostart", True).value)
+        self.configured = False
+        self.autostart = bool(self.declare_parameter("autostart", True, AUTOSTART).value)
 
     def create_publisher(self, *args: Any, **options: Any) -> Publisher:
         """A publisher without rclpy's default event handlers.
@@ -66,7 +77,10 @@ class ManagedNode(LifecycleNode):
         return self.trigger_configure() == success and self.trigger_activate() == success
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._step(self.configure)
+        self.configured = True
+        result = self._step(self.configure)
+        self.configured = result == TransitionCallbackReturn.SUCCESS
+        return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self._step(self.activate)
@@ -75,7 +89,9 @@ class ManagedNode(LifecycleNode):
         return self._step(self.deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._step(self.cleanup)
+        result = self._step(self.cleanup)
+        self.configured = result != TransitionCallbackReturn.SUCCESS
+        return result
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         steps = {"active": (self.deactivate, self.cleanup), "inactive": (self.cleanup,)}

@@ -28,7 +28,7 @@ from meslam_ros.map_models import MapModels
 from meslam_ros.map_requests import MapRequests
 from meslam_ros.map_topics import MapTopics
 from meslam_ros.node_settings import MapFrameSettings, MapServerSettings
-from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.parameters import declare_config, declare_settings, read_config
 from meslam_ros.qos import MODELS_DEPTH, latched
 from meslam_ros.region_messages import model_name
 from meslam_ros.rgbd_input import STEADY
@@ -45,9 +45,10 @@ class MapServerNode(ManagedNode):
         self._frames = declare_settings(self, MapFrameSettings)
         self._settings = declare_settings(self, MapServerSettings)
         self._config = declare_config(self, ("regions", "map", "runtime"))
-        limit_threads(self._config.runtime.threads)
 
     def configure(self) -> None:
+        self._config = read_config(self)
+        limit_threads(self._config.runtime.threads)
         self._models = MapModels(self._config, self._frames.map_frame)
         self._refused: Counter[str] = Counter()
         self._transforms = TransformBuffer(self)

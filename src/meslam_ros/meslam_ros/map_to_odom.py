@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 from rclpy.node import Node
@@ -25,13 +26,15 @@ class MapToOdom:
     Args:
         node: that broadcasts.
         map_frame, odom_frame: parent and child; an update may change the child.
-        rate_hz: of repetition.
+        rate_hz: tells how often it is repeated [Hz].
     """
 
-    def __init__(self, node: Node, map_frame: str, odom_frame: str, rate_hz: float) -> None:
+    def __init__(
+        self, node: Node, map_frame: str, odom_frame: str, rate_hz: Callable[[], float]
+    ) -> None:
         self._map_frame = map_frame
         self._odom_frame = odom_frame
-        self._period_s = 1.0 / rate_hz
+        self._rate_hz = rate_hz
         self._broadcaster = TransformBroadcaster(node)
         self._lock = threading.Lock()
         self.reset()
@@ -56,13 +59,13 @@ class MapToOdom:
             self._send(stamp_ns)
 
     def _run(self) -> None:
-        while not self._closing.wait(self._period_s):
+        while not self._closing.wait(1.0 / self._rate_hz()):
             self._repeat()
 
     def _repeat(self) -> None:
         with self._lock:
             elapsed_s = time.monotonic() - self._updated_s
-            if self._stamp_ns is not None and elapsed_s >= 0.5 * self._period_s:
+            if self._stamp_ns is not None and elapsed_s >= 0.5 / self._rate_hz():
                 ahead_s = min(elapsed_s, MAX_AHEAD_S)
                 self._send(self._stamp_ns + round(ahead_s * NANOSECONDS))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -30,10 +30,12 @@ class ModelPublisher:
         node: that publishes.
         map_frame: frame of the regions' poses.
         precision: of the weights.
-        period_s: a region is published at most once in this time [s].
+        period_s: tells in what time a region is published at most once [s].
     """
 
-    def __init__(self, node: Node, map_frame: str, precision: str, period_s: float) -> None:
+    def __init__(
+        self, node: Node, map_frame: str, precision: str, period_s: Callable[[], float]
+    ) -> None:
         self._node = node
         self._map_frame = map_frame
         self._precision = precision
@@ -76,7 +78,7 @@ class ModelPublisher:
         now = time.monotonic()
         for region in regions:
             version, offered_s = self._offered.get(region.index, (-1, float("-inf")))
-            due = final or now - offered_s >= self._period_s
+            due = final or now - offered_s >= self._period_s()
             if region.version != version and due:
                 self._offered[region.index] = region.version, now
                 stored = snapshot(region, stamp_ns)

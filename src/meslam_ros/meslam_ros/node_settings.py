@@ -1,4 +1,8 @@
-"""What the nodes can be told beyond the method's own configuration; defaults stand only here."""
+"""What the nodes can be told beyond the method's own configuration; defaults stand only here.
+
+The objects follow their parameters: who needs a number reads it when it is needed. The `live` ones
+change at any time, the others only before a node is configured.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,14 @@ from dataclasses import dataclass
 from meslam_core.setting import setting
 
 
-@dataclass(frozen=True)
+@dataclass
 class MapFrameSettings:
     """The one frame that a map needs."""
 
     map_frame: str = setting("map", "frame that the map and /meslam/pose are given in")
 
 
-@dataclass(frozen=True)
+@dataclass
 class FrameSettings(MapFrameSettings):
     """Coordinate frames (REP-105)."""
 
@@ -33,7 +37,7 @@ class FrameSettings(MapFrameSettings):
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class InputSettings:
     """Images and how they wait."""
 
@@ -43,6 +47,7 @@ class InputSettings:
         unit="s",
         minimum=0.0,
         maximum=1.0,
+        live=True,
     )
     input_timeout_s: float = setting(
         3.0,
@@ -50,10 +55,11 @@ class InputSettings:
         unit="s",
         minimum=0.5,
         maximum=3600.0,
+        live=True,
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class OdometrySettings:
     """Parameters of the odometry node alone."""
 
@@ -63,10 +69,11 @@ class OdometrySettings:
         "tracking interpolates between what comes in time",
         minimum=1,
         maximum=1000,
+        live=True,
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class TrackingSettings:
     """Parameters of the tracking node alone."""
 
@@ -75,6 +82,7 @@ class TrackingSettings:
         "image pairs that may wait for tracking; beyond, the oldest is dropped and counted",
         minimum=1,
         maximum=1000,
+        live=True,
     )
     odometry_topic: str = setting(
         "",
@@ -88,10 +96,12 @@ class TrackingSettings:
         unit="s",
         minimum=0.0,
         maximum=10.0,
+        live=True,
     )
     give_way: bool = setting(
         True,
         "while image pairs wait, training of the map ends after mapping.min_iterations steps",
+        live=True,
     )
     transform_rate_hz: float = setting(
         20.0,
@@ -99,6 +109,7 @@ class TrackingSettings:
         unit="Hz",
         minimum=1.0,
         maximum=200.0,
+        live=True,
     )
     model_period_s: float = setting(
         1.0,
@@ -106,6 +117,7 @@ class TrackingSettings:
         unit="s",
         minimum=0.1,
         maximum=60.0,
+        live=True,
     )
     path_period_s: float = setting(
         1.0,
@@ -113,6 +125,7 @@ class TrackingSettings:
         unit="s",
         minimum=0.1,
         maximum=60.0,
+        live=True,
     )
     idle_s: float = setting(
         1.0,
@@ -120,11 +133,12 @@ class TrackingSettings:
         unit="s",
         minimum=0.1,
         maximum=60.0,
+        live=True,
     )
     seed: int = setting(0, "of every random choice", minimum=0, maximum=2**31 - 1)
 
 
-@dataclass(frozen=True)
+@dataclass
 class RegionManagerSettings:
     """Parameters of the region manager alone."""
 
@@ -134,10 +148,11 @@ class RegionManagerSettings:
         unit="s",
         minimum=0.05,
         maximum=60.0,
+        live=True,
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class MapServerSettings:
     """Parameters of the map server alone; the limits bound what one request may cost."""
 
@@ -148,7 +163,12 @@ class MapServerSettings:
         "meslam_maps", "save_map and load_map use only folders below this one"
     )
     mesh_topic_resolution_m: float = setting(
-        0.05, "spacing of the mesh on the topic", unit="m", minimum=0.01, maximum=1.0
+        0.05,
+        "spacing of the mesh on the topic",
+        unit="m",
+        minimum=0.01,
+        maximum=1.0,
+        live=True,
     )
     mesh_topic_period_s: float = setting(
         5.0,
@@ -156,27 +176,53 @@ class MapServerSettings:
         unit="s",
         minimum=0.0,
         maximum=3600.0,
+        live=True,
     )
     points_topic_spacing_m: float = setting(
-        0.05, "spacing of the points on the topic", unit="m", minimum=0.01, maximum=1.0
+        0.05,
+        "spacing of the points on the topic",
+        unit="m",
+        minimum=0.01,
+        maximum=1.0,
+        live=True,
     )
     min_resolution_m: float = setting(
-        0.005, "finer meshes and grids are refused", unit="m", minimum=0.001, maximum=1.0
+        0.005,
+        "finer meshes and grids are refused",
+        unit="m",
+        minimum=0.001,
+        maximum=1.0,
+        live=True,
     )
     max_resolution_m: float = setting(
-        0.5, "coarser meshes and grids are refused", unit="m", minimum=0.01, maximum=10.0
+        0.5,
+        "coarser meshes and grids are refused",
+        unit="m",
+        minimum=0.01,
+        maximum=10.0,
+        live=True,
     )
     max_points: int = setting(
-        2_000_000, "more points in one query are refused", minimum=1, maximum=100_000_000
+        2_000_000,
+        "more points in one query are refused",
+        minimum=1,
+        maximum=100_000_000,
+        live=True,
     )
     max_cells: int = setting(
         400_000_000,
         "meshes and grids over more cells than this are refused",
         minimum=1000,
         maximum=100_000_000_000,
+        live=True,
     )
     grid_resolution_m: float = setting(
-        0.05, "cell of the occupancy grid by default", unit="m", minimum=0.01, maximum=1.0
+        0.05,
+        "cell of the occupancy grid by default",
+        unit="m",
+        minimum=0.01,
+        maximum=1.0,
+        live=True,
     )
     grid_min_height_m: float = setting(
         -0.8,
@@ -184,6 +230,7 @@ class MapServerSettings:
         unit="m",
         minimum=-1000.0,
         maximum=1000.0,
+        live=True,
     )
     grid_max_height_m: float = setting(
         0.8,
@@ -191,10 +238,11 @@ class MapServerSettings:
         unit="m",
         minimum=-1000.0,
         maximum=1000.0,
+        live=True,
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class PlayerSettings:
     """Parameters of the bag player."""
 
@@ -244,3 +292,38 @@ class PlayerSettings:
         "camera_link", "parent of the optical frame on /tf_static; empty sends no transform"
     )
     optical_frame: str = setting("camera_color_optical_frame", "frame of the images")
+
+
+@dataclass
+class CameraSettings:
+    """Parameters of the camera node."""
+
+    serial_no: str = setting("", "serial number of the camera; empty takes the first one found")
+    camera_name: str = setting(
+        "camera", "the frames are named after it: camera_link, camera_color_optical_frame, ..."
+    )
+    color_profile: str = setting("640x480x15", "width, height and rate of colour images")
+    depth_profile: str = setting(
+        "640x480x15",
+        "width, height and rate of depth images, which are then aligned to colour",
+    )
+    auto_exposure: bool = setting(True, "of both sensors; without it they keep their exposure")
+    color_exposure: int = setting(
+        0,
+        "exposure of colour without auto_exposure, in librealsense's unit (100 us on a D435); "
+        "0 keeps the camera's own",
+        minimum=0,
+        maximum=10_000,
+    )
+    emitter: bool = setting(True, "project infrared dots, so that bare walls have depth too")
+    publish_tf: bool = setting(
+        True,
+        "send the camera's frames on /tf_static; false where a robot description sends them",
+    )
+    silence_timeout_s: float = setting(
+        3.0,
+        "without images for this long, the camera counts as lost and is opened again",
+        unit="s",
+        minimum=0.5,
+        maximum=60.0,
+    )

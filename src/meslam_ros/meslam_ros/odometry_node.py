@@ -20,7 +20,7 @@ from meslam_ros.image_synchronizer import ImagePair
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.node_settings import FrameSettings, InputSettings, OdometrySettings
 from meslam_ros.odometry_messages import BaseMotion
-from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.parameters import declare_config, declare_settings, read_config
 from meslam_ros.qos import STREAM
 from meslam_ros.rgbd_input import STEADY
 from meslam_ros.transforms import CameraMount, TransformBroadcaster
@@ -35,13 +35,12 @@ class OdometryNode(ManagedNode):
         self._inputs = declare_settings(self, InputSettings)
         self._settings = declare_settings(self, OdometrySettings)
         self._config = declare_config(self, ("sensor", "odometry", "runtime"))
-        if self._config.odometry.method == "none":
-            raise ConfigError(
-                "odometry.method = none leaves nothing to do for odometry_node; do not start it"
-            )
-        limit_threads(self._config.runtime.threads)
+        self._check_method()
 
     def configure(self) -> None:
+        self._config = read_config(self)
+        self._check_method()
+        limit_threads(self._config.runtime.threads)
         self._publisher = self.create_publisher(Odometry, topics.ODOMETRY, STREAM)
         self._broadcaster = TransformBroadcaster(self)
         self._diagnostics = Diagnostics(self)
@@ -49,7 +48,7 @@ class OdometryNode(ManagedNode):
     def activate(self) -> None:
         self._begin()
         self._worker = FrameWorker(
-            self, self._inputs, self._frames, self._settings.odometry_queue_size, self
+            self, self._inputs, self._frames, lambda: self._settings.odometry_queue_size, self
         )
         self._timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
 
@@ -61,6 +60,12 @@ class OdometryNode(ManagedNode):
         self._diagnostics.close()
         self._broadcaster.close()
         self.destroy_publisher(self._publisher)
+
+    def _check_method(self) -> None:
+        if self._config.odometry.method == "none":
+            raise ConfigError(
+                "odometry.method = none leaves nothing to do for odometry_node; do not start it"
+            )
 
     def _begin(self) -> None:
         self._odometry = make_odometry(self._config.odometry, self._config.sensor)

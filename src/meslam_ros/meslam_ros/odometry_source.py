@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from nav_msgs.msg import Odometry
@@ -33,14 +34,19 @@ class OdometrySource:
         topic: of odometry from elsewhere; empty for the odometry node's.
         odom_frame: of the odometry node.
         config: whether there is any, and how odometry from elsewhere errs.
-        timeout_s: how long an image waits for its odometry [s].
+        timeout_s: tells how long an image waits for its odometry [s].
 
     Attributes:
         odom_frame: that the latest odometry was given in.
     """
 
     def __init__(
-        self, node: Node, topic: str, odom_frame: str, config: OdometryConfig, timeout_s: float
+        self,
+        node: Node,
+        topic: str,
+        odom_frame: str,
+        config: OdometryConfig,
+        timeout_s: Callable[[], float],
     ) -> None:
         self.odom_frame = odom_frame
         self._node = node
@@ -72,7 +78,7 @@ class OdometrySource:
                 throttle_duration_sec=10 * WARNING_PERIOD_S,
             )
             return None
-        messages = self._buffer.wait(frame.stamp_ns, self._timeout_s)
+        messages = self._buffer.wait(frame.stamp_ns, self._timeout_s())
         if not messages:
             log.warn(
                 f"no odometry came for the image at {frame.stamp_s:.3f} s: tracked without",

@@ -10,11 +10,11 @@ from visualization_msgs.msg import MarkerArray
 
 from meslam_interfaces.msg import RegionArray, RegionModel, TrackingStatus
 from meslam_ros import topics
-from meslam_ros.conversions import to_stamp
+from meslam_ros.conversions import NANOSECONDS, to_stamp
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.markers import region_markers
 from meslam_ros.node_settings import MapFrameSettings, RegionManagerSettings
-from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.parameters import declare_config, declare_settings, read_config
 from meslam_ros.qos import MODELS_DEPTH, STREAM, latched
 from meslam_ros.region_catalog import RegionCatalog, RegionEntry, region_index
 from meslam_ros.rgbd_input import STEADY
@@ -33,6 +33,7 @@ class RegionManagerNode(ManagedNode):
         self._changed = False
 
     def configure(self) -> None:
+        self._config = read_config(self)
         self._regions = self.create_publisher(RegionArray, topics.REGIONS, latched())
         self._markers = self.create_publisher(MarkerArray, topics.REGION_MARKERS, latched())
 
@@ -77,6 +78,9 @@ class RegionManagerNode(ManagedNode):
             self._publish()
 
     def _tick(self) -> None:
+        period_ns = round(self._settings.regions_period_s * NANOSECONDS)
+        if self._timer.timer_period_ns != period_ns:
+            self._timer.timer_period_ns = period_ns
         if self._changed:
             self._publish()
 

@@ -223,6 +223,7 @@ class RgbdInput:
         self._on_pair(pair)
 
     def _watch(self) -> None:
+        self._synchronizer.tolerance_s = self._settings.sync_tolerance_s
         for subscription in self._subscriptions:
             subscription.update()
         silence_s = time.monotonic() - self._last_pair_s

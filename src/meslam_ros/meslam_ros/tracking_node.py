@@ -26,7 +26,7 @@ from meslam_ros.mapping_session import MappingSession
 from meslam_ros.model_publisher import ModelPublisher
 from meslam_ros.node_settings import FrameSettings, InputSettings, TrackingSettings
 from meslam_ros.odometry_source import OdometrySource
-from meslam_ros.parameters import declare_config, declare_settings
+from meslam_ros.parameters import declare_config, declare_settings, read_config
 from meslam_ros.qos import STREAM, latched
 from meslam_ros.rgbd_input import STEADY
 from meslam_ros.tracking_messages import (
@@ -53,9 +53,10 @@ class TrackingNode(ManagedNode):
         self._inputs = declare_settings(self, InputSettings)
         self._settings = declare_settings(self, TrackingSettings)
         self._config = declare_config(self, MeslamConfig().to_mapping())
-        limit_threads(self._config.runtime.threads)
 
     def configure(self) -> None:
+        self._config = read_config(self)
+        limit_threads(self._config.runtime.threads)
         frames, settings = self._frames, self._settings
         self._pose = self.create_publisher(PoseStamped, topics.POSE, STREAM)
         self._covariance = self.create_publisher(
@@ -65,17 +66,17 @@ class TrackingNode(ManagedNode):
         self._status = self.create_publisher(TrackingStatus, topics.STATUS, STREAM)
         self._diagnostics = Diagnostics(self)
         self._models = ModelPublisher(
-            self, frames.map_frame, self._config.map.codec, settings.model_period_s
+            self, frames.map_frame, self._config.map.codec, lambda: settings.model_period_s
         )
         self._map_to_odom = MapToOdom(
-            self, frames.map_frame, frames.odom_frame, settings.transform_rate_hz
+            self, frames.map_frame, frames.odom_frame, lambda: settings.transform_rate_hz
         )
         self._odometry = OdometrySource(
             self,
             settings.odometry_topic,
             frames.odom_frame,
             self._config.odometry,
-            settings.odometry_timeout_s,
+            lambda: settings.odometry_timeout_s,
         )
         self._reset = self.create_service(Trigger, topics.RESET, self._on_reset)
         self._pause = self.create_service(SetBool, topics.PAUSE, self._on_pause)
@@ -85,7 +86,7 @@ class TrackingNode(ManagedNode):
 
     def activate(self) -> None:
         self._worker = FrameWorker(
-            self, self._inputs, self._frames, self._settings.queue_size, self
+            self, self._inputs, self._frames, lambda: self._settings.queue_size, self
         )
         self._timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,15 +36,45 @@ class MapSnapshot:
     map: NeuralMap
 
 
+@dataclass(frozen=True)
+class MapContent:
+    """What a store holds of a map.
+
+    Attributes:
+        map_id: of the map.
+        versions: of its regions.
+        data: the regions' files.
+        grid: the lattice; None where there is no region.
+    """
+
+    map_id: str
+    versions: dict[RegionIndex, int]
+    data: list[bytes]
+    grid: RegionGrid | None
+
+    def write(self, store: MapStore) -> None:
+        """Make a store hold this map.
+
+        Raises:
+            OutputError: when the folder cannot be written.
+        """
+        assert self.grid is not None
+        store.save(self.data, self.grid, self.map_id)
+
+
 class MapModels:
     """Takes models, checks them, and keeps the newest of each region; usable from any thread.
 
     Args:
         config: of the map's answers and of the lattice.
         map_frame: of the regions' poses.
+
+    Attributes:
+        before_replacing: called before another map takes the place of the one that is there.
     """
 
     def __init__(self, config: MeslamConfig, map_frame: str) -> None:
+        self.before_replacing: Callable[[], None] = lambda: None
         self._catalog = RegionCatalog()
         self._config = config
         self._map_frame = map_frame
@@ -65,9 +96,14 @@ class MapModels:
             MapError: when the model is damaged, of another format, or contradicts itself.
         """
         with self._lock:
-            if model.map_id == self._replaced_map_id or not self._catalog.is_news(model):
+            if not self._is_wanted(model):
                 return False
-            region = stored_region(model)
+        region = stored_region(model)
+        if model.map_id != self.map_id:
+            self.before_replacing()
+        with self._lock:
+            if not self._is_wanted(model):
+                return False
             self._live_map_id = model.map_id
             if model.map_id != self._catalog.map_id:
                 self._begin(model.map_id)
@@ -76,6 +112,9 @@ class MapModels:
             self._data[region.index] = bytes(model.data)
             self._snapshot = None
             return True
+
+    def _is_wanted(self, model: RegionModel) -> bool:
+        return model.map_id != self._replaced_map_id and self._catalog.is_news(model)
 
     def snapshot(self) -> MapSnapshot:
         """The map as it is now.
@@ -111,15 +150,24 @@ class MapModels:
             return self._catalog.map_id
 
     def save(self, path: Path) -> int:
-        """Write the map to a store; returns the number of regions.
+        """Write the map to a folder; returns the number of regions.
 
         Raises:
             OutputError: when the folder cannot be written.
         """
+        content = self.content()
+        content.write(MapStore(path))
+        return len(content.data)
+
+    def content(self) -> MapContent:
+        """What a store holds of the map as it is now."""
         with self._lock:
-            data, grid, map_id = list(self._data.values()), self._grid(), self._catalog.map_id
-        MapStore(path).save(data, grid, map_id)
-        return len(data)
+            return MapContent(
+                map_id=self._catalog.map_id,
+                versions={i: entry.version for i, entry in self._catalog.entries.items()},
+                data=list(self._data.values()),
+                grid=self._grid() if self._regions else None,
+            )
 
     def load(self, path: Path) -> list[str]:
         """Replace the map by a stored one; returns one sentence for every damaged region.
@@ -133,6 +181,7 @@ class MapModels:
             region_model(region, loaded.map_id, self._map_frame, precision)
             for region in loaded.regions
         ]
+        self.before_replacing()
         # Networks that were stored with this precision encode to the very same bytes again.
         with self._lock:
             self._begin(loaded.map_id)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -24,6 +25,7 @@ from meslam_interfaces.srv import (
 from meslam_ros import topics
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, WARN, Diagnostics, counts
 from meslam_ros.managed_node import ManagedNode, run
+from meslam_ros.map_keeper import RECENT, MapKeeper
 from meslam_ros.map_models import MapModels
 from meslam_ros.map_requests import MapRequests
 from meslam_ros.map_topics import MapTopics
@@ -50,6 +52,11 @@ class MapServerNode(ManagedNode):
         self._config = read_config(self)
         limit_threads(self._config.runtime.threads)
         self._models = MapModels(self._config, self._frames.map_frame)
+        self._keeper = MapKeeper(
+            self._models, self._kept_folder, self._settings, self.get_logger().warn
+        )
+        if self._settings.restore and (restored := self._keeper.restore()):
+            self.get_logger().info(f"serving the map kept in {restored} until another one comes")
         self._refused: Counter[str] = Counter()
         self._transforms = TransformBuffer(self)
         requests = MapRequests(
@@ -75,7 +82,14 @@ class MapServerNode(ManagedNode):
         ]
         self._diagnostics = Diagnostics(self)
 
+    @property
+    def _kept_folder(self) -> Path:
+        """Another one for each namespace: systems side by side do not mix their maps."""
+        folder = Path(self._settings.map_folder).expanduser() / RECENT
+        return folder / self.get_namespace().strip("/")
+
     def activate(self) -> None:
+        self._keeper.start()
         self._subscription = self.create_subscription(
             RegionModel,
             topics.REGION_MODELS,
@@ -90,6 +104,7 @@ class MapServerNode(ManagedNode):
         self.destroy_timer(self._timer)
         self._topics.close()
         self.destroy_subscription(self._subscription)
+        self._keeper.close()
 
     def cleanup(self) -> None:
         self._diagnostics.close()

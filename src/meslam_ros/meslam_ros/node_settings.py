@@ -162,6 +162,26 @@ class MapServerSettings:
     map_folder: str = setting(
         "meslam_maps", "save_map and load_map use only folders below this one"
     )
+    kept_maps: int = setting(
+        5,
+        "so many maps are kept below map_folder/recent without being asked, the one that is "
+        "served and those before it; 0 keeps none",
+        minimum=0,
+        maximum=1000,
+        live=True,
+    )
+    keep_period_s: float = setting(
+        5.0,
+        "the map that is served is written there at most once in this time, and when it ends",
+        unit="s",
+        minimum=0.1,
+        maximum=3600.0,
+        live=True,
+    )
+    restore: bool = setting(
+        True,
+        "at start, serve the map that was kept last until tracking publishes regions",
+    )
     mesh_topic_resolution_m: float = setting(
         0.05,
         "spacing of the mesh on the topic",
@@ -268,7 +288,7 @@ class PlayerSettings:
         0, "how many image pairs to play, 0 for all", minimum=0, maximum=2**31 - 1
     )
     step: int = setting(1, "play every n-th image pair", minimum=1, maximum=1000)
-    loop: bool = setting(False, "start again at the end")
+    loop: bool = setting(False, "start again at the end", live=True)
     clock: bool = setting(True, "publish the images' time on /clock")
     subscribers: int = setting(
         1,
@@ -307,15 +327,20 @@ class CameraSettings:
         "640x480x15",
         "width, height and rate of depth images, which are then aligned to colour",
     )
-    auto_exposure: bool = setting(True, "of both sensors; without it they keep their exposure")
+    auto_exposure: bool = setting(
+        True, "of both sensors; without it they keep their exposure", live=True
+    )
     color_exposure: int = setting(
         0,
         "exposure of colour without auto_exposure, in librealsense's unit (100 us on a D435); "
         "0 keeps the camera's own",
         minimum=0,
         maximum=10_000,
+        live=True,
     )
-    emitter: bool = setting(True, "project infrared dots, so that bare walls have depth too")
+    emitter: bool = setting(
+        True, "project infrared dots, so that bare walls have depth too", live=True
+    )
     publish_tf: bool = setting(
         True,
         "send the camera's frames on /tf_static; false where a robot description sends them",
@@ -326,4 +351,5 @@ class CameraSettings:
         unit="s",
         minimum=0.5,
         maximum=60.0,
+        live=True,
     )

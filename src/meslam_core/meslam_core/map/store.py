@@ -48,6 +48,7 @@ class MapStore:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._written: dict[tuple[RegionIndex, int, int, str], RegionEntry] = {}
+        self._stored: dict[str, RegionEntry] = {}
 
     def save(
         self,
@@ -127,6 +128,7 @@ class MapStore:
         write_atomically(self.path / MANIFEST, manifest.to_bytes())
         current = set(manifest.regions)
         self._written = {key: e for key, e in self._written.items() if e in current}
+        self._stored = {entry.sha256: entry for entry in current}
         self._clean(manifest, previous)
         return map_id
 
@@ -135,6 +137,9 @@ class MapStore:
     ) -> tuple[RegionEntry, bytes | None]:
         """A region's entry, and its bytes unless this store wrote the same version before."""
         if isinstance(region, bytes):
+            stored = self._stored.get(hashlib.sha256(region).hexdigest())
+            if stored is not None:
+                return stored, region
             decoded = codec.decode(region)
             return RegionEntry.of(decoded.index, decoded.version, region), region
         key = (region.index, region.version, region.stamp_ns, precision)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import islice
 from typing import Any
 
@@ -20,7 +21,7 @@ from meslam_core.frame import RgbdFrame
 from meslam_core.mapping.keyframe_images import KeyframeImage, KeyframeImages
 from meslam_core.mapping.keyframe_links import MeasuredMotion
 from meslam_core.mapping.keyframes import KeyframeStore, Rays
-from meslam_core.odometry import make_registrar
+from meslam_core.odometry import Registration, make_registrar
 from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose, inverse, rotation_angle
 
@@ -29,6 +30,8 @@ JUDGED_POINTS = 64
 MIN_OVERLAP = 0.5
 ATTEMPTS_A_LINK = 2
 LEAST_ATTEMPTS = 3
+# So many older keyframes stay ready: the next keyframe is mostly linked to the same ones.
+READY_KEYFRAMES = 8
 MIN_FITNESS = 0.6
 MIN_AGREEMENT = 0.3
 # A registration farther from where the keyframes are believed to be is not believed itself.
@@ -68,6 +71,7 @@ class CovisibilityLinker:
         self._registrar = make_registrar(odometry, config.sensor)
         self._reach_m = config.sensor.max_depth_m
         self._images = KeyframeImages(scratch)
+        self._ready = lru_cache(maxsize=READY_KEYFRAMES)(self._prepare_older)
 
     def link(
         self,
@@ -84,7 +88,7 @@ class CovisibilityLinker:
             rays: its sample, camera frame.
             frames_wait: while they do, no more than `LEAST_ATTEMPTS` registrations are made.
         """
-        image = KeyframeImage.of(frame, self._width)
+        image = self.image(frame)
         older = islice(
             self._candidates(keyframe, frame.camera, rays), ATTEMPTS_A_LINK * self._links
         )
@@ -112,23 +116,46 @@ class CovisibilityLinker:
         shared = [k for k, overlap in overlaps if overlap > MIN_RECOGNISED_OVERLAP]
         if not shared:
             return None
-        prepared = self._registrar.prepare(KeyframeImage.of(frame, self._width).frame())
+        prepared = self.prepare(self.image(frame))
         links: list[MeasuredMotion] = []
         for other in shared[:RECOGNITION_ATTEMPTS]:
-            T_other_keyframe = self._search(other, keyframe, prepared)
-            if T_other_keyframe is None:
+            guess = inverse(self._keyframes.pose(other)) @ self._keyframes.pose(keyframe)
+            found = self.find(other, prepared, guess)
+            if found is None:
                 continue
-            link = MeasuredMotion(other, keyframe, T_other_keyframe)
+            link = MeasuredMotion(other, keyframe, found.T_target_source)
             alike = [each for each in links if self._agree(each, link)]
             if len(alike) + 1 >= RECOGNISING:
                 return [*alike, link]
             links.append(link)
         return []
 
-    def _search(self, older: int, keyframe: int, prepared: Any) -> Pose | None:
-        """T_older_new (4, 4) where any start leads to a good fit; None where none does."""
-        guess = inverse(self._keyframes.pose(older)) @ self._keyframes.pose(keyframe)
-        target = self._registrar.prepare(self._images.get(older).frame())
+    def image(self, frame: RgbdFrame) -> KeyframeImage:
+        """What is kept of a frame that becomes a keyframe."""
+        return KeyframeImage.of(frame, self._width)
+
+    def image_of(self, keyframe: int) -> KeyframeImage:
+        """What is kept of a keyframe that was linked.
+
+        Raises:
+            KeyError: it was not.
+            OutputError: when the disk fails.
+        """
+        return self._images.get(keyframe)
+
+    def prepare(self, image: KeyframeImage) -> Any:
+        """An image made ready for `find`."""
+        return self._registrar.prepare(image.frame())
+
+    def find(self, older: int, prepared: Any, guess: Pose) -> Registration | None:
+        """Where a view is in a keyframe, if a good fit tells; else None.
+
+        Args:
+            older: a keyframe that was linked.
+            prepared: the view.
+            guess: T_older_view (4, 4), which may be far off: features propose others.
+        """
+        target = self._ready(older)
         best = None
         try:
             for start in (*self._registrar.propose(prepared, target), guess):
@@ -141,9 +168,10 @@ class CovisibilityLinker:
             return None
         fits = best.fitness >= MIN_FITNESS and best.agreement >= MIN_AGREEMENT
         alike = best.agreement >= MIN_LIKENESS * best.fitness
-        if fits or (best.fitness >= MIN_RECOGNISED_FITNESS and alike):
-            return best.T_target_source
-        return None
+        return best if fits or (best.fitness >= MIN_RECOGNISED_FITNESS and alike) else None
+
+    def _prepare_older(self, number: int) -> Any:
+        return self.prepare(self._images.get(number))
 
     def _agree(self, first: MeasuredMotion, second: MeasuredMotion) -> bool:
         """Whether two links say the same of where the new keyframe is."""
@@ -160,7 +188,7 @@ class CovisibilityLinker:
         frames_wait: Callable[[], bool] = lambda: False,
     ) -> list[MeasuredMotion]:
         links: list[MeasuredMotion] = []
-        prepared = self._registrar.prepare(image.frame())
+        prepared = self.prepare(image)
         for attempt, other in enumerate(others):
             if len(links) >= self._links or (attempt >= LEAST_ATTEMPTS and frames_wait()):
                 break
@@ -172,7 +200,7 @@ class CovisibilityLinker:
     def _register(self, older: int, keyframe: int, prepared: object) -> Pose | None:
         """T_older_new (4, 4) where the two fit; None where not."""
         guess = inverse(self._keyframes.pose(older)) @ self._keyframes.pose(keyframe)
-        target = self._registrar.prepare(self._images.get(older).frame())
+        target = self._ready(older)
         try:
             found = self._registrar.register(prepared, target, guess)
         except RuntimeError:

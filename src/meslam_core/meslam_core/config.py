@@ -218,6 +218,73 @@ class TrackingConfig:
     lost_after_frames: int = setting(
         10, "untrusted poses in a row after which tracking is lost", minimum=1, maximum=1000
     )
+    max_speed_m_s: float = setting(
+        3.0, "faster motion is not believed", unit="m/s", minimum=0.1, maximum=50.0
+    )
+    max_turn_deg_s: float = setting(
+        300.0, "faster turning is not believed", unit="deg/s", minimum=10.0, maximum=3000.0
+    )
+    max_conflict_m: float = setting(
+        0.15,
+        "a pose farther from where odometry has it is not trusted",
+        unit="m",
+        minimum=0.01,
+        maximum=10.0,
+    )
+    max_conflict_deg: float = setting(
+        10.0,
+        "a pose turned farther from where odometry has it is not trusted",
+        unit="deg",
+        minimum=0.5,
+        maximum=180.0,
+    )
+    doubted_inlier_ratio: float = setting(
+        0.5,
+        "share of inliers below which a pose is not trusted where odometry does not support it",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    doubted_colour_likeness: float = setting(
+        0.4,
+        "correlation of measured and mapped luma below which a pose is not trusted where odometry "
+        "does not support it",
+        minimum=-1.0,
+        maximum=1.0,
+    )
+
+
+@dataclass(frozen=True)
+class RelocalisationConfig:
+    """How a camera that was lost is found again in the map."""
+
+    keyframes: int = setting(
+        1000, "keyframes whose looks are remembered, 3.2 kB each", minimum=1, maximum=100000
+    )
+    candidates: int = setting(
+        2, "keyframes that a lost frame is compared with", minimum=0, maximum=100
+    )
+    min_observed_ratio: float = setting(
+        0.5, "share of a frame's points that must lie in mapped space", minimum=0.0, maximum=1.0
+    )
+    min_inlier_ratio: float = setting(
+        0.7, "share of those that must lie on the map", minimum=0.0, maximum=1.0
+    )
+    max_residual_m: float = setting(
+        0.03, "median distance to the map at most", unit="m", minimum=0.001, maximum=0.5
+    )
+    min_colour_likeness: float = setting(
+        0.5, "correlation of measured and mapped luma at least", minimum=-1.0, maximum=1.0
+    )
+    agreement_m: float = setting(
+        0.05,
+        "two frames in a row must tell the same place within this",
+        unit="m",
+        minimum=0.001,
+        maximum=1.0,
+    )
+    agreement_deg: float = setting(
+        3.0, "the same of the direction", unit="deg", minimum=0.1, maximum=90.0
+    )
 
 
 @dataclass(frozen=True)
@@ -392,6 +459,7 @@ class MeslamConfig:
     odometry: OdometryConfig = OdometryConfig()
     field: FieldConfig = FieldConfig()
     tracking: TrackingConfig = TrackingConfig()
+    relocalisation: RelocalisationConfig = RelocalisationConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     mapping: MappingConfig = MappingConfig()
     regions: RegionsConfig = RegionsConfig()

@@ -98,7 +98,7 @@ class Slam:
         self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
         self._chain = KeyframeChain(self.keyframes)
         self.policy = KeyframePolicy(config.keyframes, config.field)
-        self.tracking = FrameTracking(config.tracking, T_map_camera)
+        self.tracking = FrameTracking(config.tracking, T_map_camera, config.relocalisation)
         self._history = self.tracking.history
         self.atlas: RegionAtlas | None = None
         self._frames_wait = frames_wait
@@ -151,6 +151,8 @@ class Slam:
         if self._view is not None:
             rays = self._sample(frame, pixels, self.config.tracking.points) if enough else None
             tracked = self.tracking.track(frame.stamp_ns, self._view, rays, odometry)
+            if self.tracking.lost:
+                tracked = self._sought(frame, rays, odometry) or tracked
         elif enough:
             tracked = self.tracking.start(self._T_map_first.copy())
         else:
@@ -171,7 +173,8 @@ class Slam:
         )
         reference, relative = 0, np.eye(4)
         if self._view is not None:
-            reference = self._history.newest_keyframe
+            newest = self._history.newest_keyframe
+            reference = newest if tracked.reference is None else tracked.reference
             relative = inverse(self._history.keyframe_pose(reference)) @ tracked.T_map_camera
         self._pending = _Pending(
             frame, pixels, tracked, result, reference, orthonormalized(relative)
@@ -185,6 +188,8 @@ class Slam:
         result, trusted = pending.result, pending.tracked.trusted
         trained = self._finish_training()
         self._chain.pass_by(result.odometry)
+        if self.tracking.lost:
+            self._chain.cut()
         is_keyframe = trusted and self.atlas is None
         if is_keyframe:
             self._start(pending)
@@ -257,6 +262,23 @@ class Slam:
     def online_trajectory(self) -> Trajectory:
         """T_map_camera of every frame as it was known when the frame was done."""
         return self._history.online_trajectory()
+
+    def _sought(
+        self, frame: RgbdFrame, rays: Rays | None, odometry: OdometryEstimate | None
+    ) -> TrackedPose | None:
+        """Look for a lost camera in the whole map; None where it is as lost as it was."""
+        assert self._training is not None
+        assert self.atlas is not None
+        # It looks into regions and keyframes, which belong to the training that runs.
+        self._finish_training()
+        sighting = None
+        if rays is not None:
+            sighting = self._training.relocaliser.find(frame, rays, self.tracking.believed)
+        tracked = self.tracking.recover(frame.stamp_ns, sighting, odometry)
+        if sighting is not None and tracked is not None and tracked.trusted:
+            self.atlas.enter(sighting.region)
+            self._look()
+        return tracked
 
     def _sample(self, frame: RgbdFrame, pixels: TrustedPixels, count: int) -> Rays:
         return rays_at(frame, *pixels.choose(count, self._generator))

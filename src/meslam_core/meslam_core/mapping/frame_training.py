@@ -10,6 +10,7 @@ from functools import partial
 from meslam_core.config import MeslamConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.loop.recognition import RegionRecogniser
+from meslam_core.loop.relocalisation import Relocaliser
 from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.joint_optimizer import JointOptimizer
 from meslam_core.mapping.keyframes import Rays
@@ -44,6 +45,7 @@ class FrameTraining:
     Attributes:
         latest: what the latest training did that was waited for.
         recogniser: asks regions that woke, where loops are closed.
+        relocaliser: finds a lost camera, while no training runs.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class FrameTraining:
             self._linker = CovisibilityLinker(self._keyframes, config, scratch)
             if config.regions.close_loops:
                 self.recogniser = RegionRecogniser(atlas, self._linker)
+        self.relocaliser = Relocaliser(config.relocalisation, config.tracking, atlas, self._linker)
 
     def start_first(self) -> None:
         """Begin to train the first region from nothing, with the first keyframe."""
@@ -159,6 +162,7 @@ class FrameTraining:
             return False
         for link in self._linker.link(*keyframe, self._frames_wait):
             self._keyframes.add_link(link.first, link.second, link.T_first_second)
+        self.relocaliser.remember(keyframe[0])
         if self.recogniser is None:
             return False
         corrections = self.recogniser.corrections

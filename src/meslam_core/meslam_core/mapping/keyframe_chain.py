@@ -26,6 +26,10 @@ class KeyframeChain:
         if odometry is not None and not odometry.valid:
             self._latest = None
 
+    def cut(self) -> None:
+        """Tie the next keyframe to none: the camera was lost in between."""
+        self._latest = None
+
     def add(
         self, stamp_ns: int, T_map_camera: Pose, rays: Rays, odometry: OdometryEstimate | None
     ) -> int:

@@ -10,13 +10,19 @@ from meslam_core.odometry.direct import DirectRegistrar
 from meslam_core.odometry.given_odometry import GivenOdometry, NoOdometry, given_noise
 from meslam_core.odometry.keyframe_odometry import KeyframeOdometry
 from meslam_core.odometry.odometry import MotionNoise, Odometry, OdometryEstimate
-from meslam_core.odometry.registration import ColoredIcpRegistrar, HybridRegistrar, Registrar
+from meslam_core.odometry.registration import (
+    ColoredIcpRegistrar,
+    HybridRegistrar,
+    Registrar,
+    Registration,
+)
 
 __all__ = [
     "GivenOdometry",
     "MotionNoise",
     "Odometry",
     "OdometryEstimate",
+    "Registration",
     "given_noise",
     "make_odometry",
     "make_registrar",

@@ -81,7 +81,7 @@ class RegionAtlas:
         """Go on with regions of an earlier session; the one nearest to `position` (3,) works."""
         self.grid = grid
         self.regions = {region.index: region for region in regions}
-        self._working = min(self.regions, key=lambda index: self._off_center(index, position))
+        self._working = self.nearest(position).index
         self._wake(self.working)
 
     @property
@@ -148,6 +148,21 @@ class RegionAtlas:
         if distance < working - 2.0 * self.config.regions.hysteresis_m:
             return nearest
         return self._working
+
+    def nearest(self, position: NDArray[np.floating]) -> Region:
+        """The region whose centre a position (3,), map frame [m], is nearest to."""
+        return self.regions[min(self.regions, key=lambda i: self._off_center(i, position))]
+
+    def look_into(self, region: Region) -> None:
+        """Wake a region to be asked; what was looked into before goes back to rest."""
+        region.wake()
+        self._rest_except([region, *self.active, *self._awake])
+
+    def enter(self, region: Region) -> None:
+        """Let a region work in which the camera has been recognised, wherever it was before."""
+        self._working = region.index
+        region.wake()
+        region.confirmed = True
 
     def _about(self, on_lattice: NDArray[np.floating]) -> list[RegionIndex]:
         """Existing regions whose boxes may be near a position on the lattice (3,) [m]."""

@@ -73,6 +73,8 @@ class FrameHistory:
         self._measured: deque[_Measured] = deque(maxlen=MAX_ODOMETRY_GAP)
         # By keyframe: how the next one was tracked in it, and when.
         self._handovers: dict[int, tuple[Pose, int]] = {}
+        # Number of the first frame since the path was last broken off.
+        self._begun = 0
 
     def __len__(self) -> int:
         return self._count
@@ -106,8 +108,14 @@ class FrameHistory:
             self._measured.append(_Measured(self._count, odometry))
         self._count += 1
 
+    def break_off(self) -> None:
+        """The next frame is where it was found, whatever the frames before say of their motion."""
+        self._begun = self._count
+
     def hand_over(self, reference: int, T_reference_next: Pose) -> None:
         """The next frame becomes a keyframe: how it was tracked in the one before, (4, 4)."""
+        if self._begun == self._count:
+            return
         self._handovers[reference] = (T_reference_next, self._count)
 
     @property
@@ -136,7 +144,7 @@ class FrameHistory:
     def extrapolated(self, stamp_ns: int) -> Pose:
         """T_map_camera (4, 4) at a time after the latest frame, its motion continued."""
         latest = self.pose(-1)
-        if self._count < 2:
+        if self._count - self._begun < 2:
             return latest
         before_ns, last_ns = self._stamps_ns[self._count - 2 : self._count]
         ahead = min((stamp_ns - last_ns) / max(last_ns - before_ns, 1), MAX_EXTRAPOLATION)
@@ -151,7 +159,7 @@ class FrameHistory:
         if odometry is None or not odometry.valid or not self._measured:
             return None
         last = self._measured[-1]
-        if self._count - last.number > MAX_ODOMETRY_GAP:
+        if self._count - last.number > MAX_ODOMETRY_GAP or last.number < self._begun:
             return None
         motion = inverse(last.odometry.T_odom_camera) @ odometry.T_odom_camera
         return self.pose(last.number), motion

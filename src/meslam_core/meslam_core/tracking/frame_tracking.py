@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meslam_core.config import TrackingConfig
+from meslam_core.config import RelocalisationConfig, TrackingConfig
 from meslam_core.frame_result import TrackingState
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.odometry import MotionNoise, OdometryEstimate
@@ -15,6 +15,9 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.frame_history import FrameHistory
+from meslam_core.tracking.plausibility import Plausibility
+from meslam_core.tracking.recovery import Recovery
+from meslam_core.tracking.sighting import Sighting
 
 # Below this share of inliers the other first guesses are tried too.
 CONFIDENT_INLIERS = 0.85
@@ -37,6 +40,7 @@ class TrackedPose:
         trusted: whether it may train the map.
         reason: why the field did not confirm it; empty where it did.
         alignment: with the field, where there was enough to align.
+        reference: number of the keyframe it was recognised in; None where tracking went on.
     """
 
     T_map_camera: Pose
@@ -44,6 +48,7 @@ class TrackedPose:
     trusted: bool
     reason: str
     alignment: Alignment | None
+    reference: int | None = None
 
 
 @dataclass(frozen=True)
@@ -61,21 +66,39 @@ class FrameTracking:
     Args:
         config: limits of what is believed.
         T_map_first: (4, 4) where the first frame is believed to be.
+        relocalisation: what finds it again when it is lost.
 
     Attributes:
         history: of all frames; who maps the frame adds it.
         state: after the latest frame.
     """
 
-    def __init__(self, config: TrackingConfig, T_map_first: Pose | None = None) -> None:
+    def __init__(
+        self,
+        config: TrackingConfig,
+        T_map_first: Pose | None = None,
+        relocalisation: RelocalisationConfig | None = None,
+    ) -> None:
         self.config = config
         self._T_map_first = np.eye(4) if T_map_first is None else T_map_first
         self.history = FrameHistory()
         self.state = TrackingState.INITIALISING
         self._tracker = FieldTracker(config)
         self._noise = registered_noise(config)
+        self._plausibility = Plausibility(config, self.history)
+        self._recovery = Recovery(relocalisation or RelocalisationConfig())
         self._untrusted = 0
         self._covariance = np.eye(6) * FIRST_VARIANCE
+
+    @property
+    def lost(self) -> bool:
+        """Whether the camera has to be found in the map before tracking goes on."""
+        return self.state in (TrackingState.LOST, TrackingState.RELOCALISING)
+
+    @property
+    def believed(self) -> list[Pose]:
+        """Where a lost camera may be (4, 4): where it was last trusted, and moved from there on."""
+        return [self._plausibility.last_trusted, self.history.pose(-1)]
 
     def start(self, T_map_camera: Pose) -> TrackedPose:
         """The first frame's pose is given."""
@@ -95,24 +118,68 @@ class FrameTracking:
         """
         alignment = None
         verdict = _Verdict(trusted=False, reason="too few pixels with depth")
+        self._plausibility.pass_by(odometry)
+        if self.lost:
+            return self._still_lost(odometry)
         prior = self._prior(stamp_ns, odometry)
         if rays is not None:
             alignment = self._align(region, rays, self._guesses(stamp_ns, odometry), prior)
-            verdict = self._judge(alignment, odometry)
+            verdict = self._judge(stamp_ns, region, rays, alignment, prior, odometry)
         if alignment is not None and verdict.by_field:
-            self._untrusted = 0
-            self.state = TrackingState.OK
-            pose = alignment.T_map_camera
-            self._covariance = inverted(alignment.information + np.eye(6))
+            return self._confirmed(stamp_ns, alignment)
+        self._untrusted = 0 if verdict.trusted else self._untrusted + 1
+        if self._untrusted >= self.config.lost_after_frames:
+            self.state = TrackingState.LOST
+            self._recovery.reset()
         else:
-            self._untrusted = 0 if verdict.trusted else self._untrusted + 1
-            lost = self._untrusted >= self.config.lost_after_frames
-            self.state = TrackingState.LOST if lost else TrackingState.DEGRADED
-            pose = prior.T_map_camera
-            # Uncertainty grows from where it was: without a bound, the next frame could slide
-            # anywhere along a plain wall.
-            self._covariance = np.eye(6) * UNTRUSTED_VARIANCE if lost else prior.covariance
-        return TrackedPose(pose, self._covariance, verdict.trusted, verdict.reason, alignment)
+            self.state = TrackingState.DEGRADED
+        # Uncertainty grows from where it was: without a bound, the next frame could slide
+        # anywhere along a plain wall.
+        self._covariance = np.eye(6) * UNTRUSTED_VARIANCE if self.lost else prior.covariance
+        return TrackedPose(
+            prior.T_map_camera, self._covariance, verdict.trusted, verdict.reason, alignment
+        )
+
+    def recover(
+        self, stamp_ns: int, sighting: Sighting | None, odometry: OdometryEstimate | None
+    ) -> TrackedPose | None:
+        """Take up where a lost camera was recognised; it is found when two frames agree.
+
+        Args:
+            stamp_ns: of the frame's image [ns].
+            sighting: what was found; None where it was not recognised.
+            odometry: of the frame, where there is one.
+
+        Returns:
+            The frame's pose, to be trusted or not; None where it is as lost as it was.
+        """
+        if sighting is None:
+            self.state = TrackingState.LOST
+            self._recovery.reset()
+            return None
+        alignment = sighting.alignment
+        if self._recovery.confirms(alignment.T_map_camera, odometry):
+            self._recovery.reset()
+            self.history.break_off()
+            return replace(self._confirmed(stamp_ns, alignment), reference=sighting.keyframe)
+        self.state = TrackingState.RELOCALISING
+        reason = "recognised once; a second frame has to agree"
+        return TrackedPose(alignment.T_map_camera, self._covariance, False, reason, alignment)
+
+    def _confirmed(self, stamp_ns: int, alignment: Alignment) -> TrackedPose:
+        """The field tells the pose."""
+        self._untrusted = 0
+        self.state = TrackingState.OK
+        self._covariance = inverted(alignment.information + np.eye(6))
+        self._plausibility.confirm(stamp_ns)
+        return TrackedPose(alignment.T_map_camera, self._covariance, True, "", alignment)
+
+    def _still_lost(self, odometry: OdometryEstimate | None) -> TrackedPose:
+        """Where odometry alone has a lost camera, or else where it was."""
+        moved = self.history.moved(odometry)
+        pose = self.history.pose(-1) if moved is None else orthonormalized(moved[0] @ moved[1])
+        reason = "lost: nothing in the map looks like this view"
+        return TrackedPose(pose, np.eye(6) * UNTRUSTED_VARIANCE, False, reason, None)
 
     def _align(
         self, region: Region, rays: Rays, guesses: list[Pose], prior: PosePrior
@@ -153,15 +220,23 @@ class FrameTracking:
         guesses.append(self.history.pose(-1))
         return [orthonormalized(guess) for guess in guesses]
 
-    def _judge(self, alignment: Alignment, odometry: OdometryEstimate | None) -> _Verdict:
+    def _judge(
+        self,
+        stamp_ns: int,
+        region: Region,
+        rays: Rays,
+        alignment: Alignment,
+        prior: PosePrior,
+        odometry: OdometryEstimate | None,
+    ) -> _Verdict:
         """Whether an alignment may be trusted, or odometry in its place."""
-        limits = self.config
+        limits, plausibility = self.config, self._plausibility
         if not np.isfinite(alignment.T_map_camera).all():
             return _Verdict(trusted=False, reason="the pose is not finite")
         if alignment.observed_ratio < limits.min_observed_ratio:
             # Beyond what is mapped only odometry knows; without it the map could not grow.
             return _Verdict(
-                trusted=odometry is not None and odometry.valid,
+                trusted=plausibility.supported,
                 reason=f"only {alignment.observed_ratio:.0%} of the view is mapped",
             )
         if alignment.inlier_ratio < limits.min_inlier_ratio:
@@ -170,7 +245,8 @@ class FrameTracking:
         if alignment.residual_m > limits.max_residual_m:
             distance = f"{alignment.residual_m * 100:.1f} cm"
             return _Verdict(trusted=False, reason=f"points lie {distance} off the map")
-        return _Verdict(trusted=True, by_field=True)
+        objection = plausibility.objection(stamp_ns, region, rays, alignment, prior)
+        return _Verdict(trusted=not objection, by_field=not objection, reason=objection)
 
 
 def registered_noise(config: TrackingConfig) -> MotionNoise:

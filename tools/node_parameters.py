@@ -25,6 +25,7 @@ NODES = {
     node_settings.RegionManagerSettings: "region manager",
     node_settings.MapServerSettings: "map server",
     node_settings.PlayerSettings: "player",
+    node_settings.CameraSettings: "camera",
 }
 
 

@@ -13,6 +13,7 @@ NODES = (
     "map_server_node",
     "slam_node",
     "bag_player_node",
+    "camera_node",
 )
 # colcon runs a symlink of this file in its build folder: the folders beside the real file count.
 PACKAGE_DIR = Path(__file__).resolve().parent

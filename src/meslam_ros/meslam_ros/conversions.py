@@ -93,19 +93,20 @@ def camera_to_info(camera: PinholeCamera, stamp: Time, frame_id: str) -> CameraI
 
 def color_message(color: NDArray[np.uint8], stamp: Time, frame_id: str) -> Image:
     """An rgb8 image of pixels (H, W, 3)."""
-    return _image(color, "rgb8", stamp, frame_id)
+    return image_message(color, "rgb8", stamp, frame_id)
 
 
 def depth_message(depth_m: NDArray[np.float32], encoding: str, stamp: Time, frame_id: str) -> Image:
     """A depth image, `16UC1` in millimetres or `32FC1` in metres, of depth (H, W) [m]."""
     if encoding == "32FC1":
-        return _image(depth_m.astype("<f4"), encoding, stamp, frame_id)
+        return image_message(depth_m.astype("<f4"), encoding, stamp, frame_id)
     millimetres = np.rint(depth_m * MILLIMETRES)
     millimetres[millimetres > MAX_DEPTH_MM] = 0
-    return _image(millimetres.astype("<u2"), "16UC1", stamp, frame_id)
+    return image_message(millimetres.astype("<u2"), "16UC1", stamp, frame_id)
 
 
-def _image(pixels: NDArray[Any], encoding: str, stamp: Time, frame_id: str) -> Image:
+def image_message(pixels: NDArray[Any], encoding: str, stamp: Time, frame_id: str) -> Image:
+    """An image message of pixels (H, W) or (H, W, channels) as they are."""
     message = Image(height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
     message.header.stamp, message.header.frame_id = stamp, frame_id
     message.step = pixels.nbytes // pixels.shape[0]

@@ -333,7 +333,7 @@ class CameraSettings:
     color_exposure: int = setting(
         0,
         "exposure of colour without auto_exposure, in librealsense's unit (100 us on a D435); "
-        "0 keeps the camera's own",
+        "limited to what the camera takes; 0 keeps its own",
         minimum=0,
         maximum=10_000,
         live=True,

@@ -109,11 +109,9 @@ class Playback:
             depth_camera, depth_lens = _camera(depth)
         except (RuntimeError, FrameError) as error:
             raise RecordingError(f"{self._path} has no calibration: {error}") from error
-        pose = np.eye(4)
-        # librealsense writes rotations column by column.
-        pose[:3, :3] = np.asarray(extrinsics.rotation).reshape(3, 3).T
-        pose[:3, 3] = extrinsics.translation
-        return Calibration(color_camera, color_lens, depth_camera, depth_lens, pose)
+        return Calibration(
+            color_camera, color_lens, depth_camera, depth_lens, pose_of_extrinsics(extrinsics)
+        )
 
     def images(self, wanted: Callable[[str, int], bool]) -> Generator[StreamImage, None, None]:
         """All images of both streams, each stream in order; once only.
@@ -198,6 +196,15 @@ class Playback:
 def stamp_of_milliseconds(milliseconds: float) -> int:
     """Stamp [ns], to the microsecond: librealsense keeps time in floating-point milliseconds."""
     return round(milliseconds * 1e3) * 1000
+
+
+def pose_of_extrinsics(extrinsics: Any) -> se3.Pose:
+    """The (4, 4) pose [m] that librealsense's extrinsics mean."""
+    pose = np.eye(4)
+    # librealsense writes rotations column by column.
+    pose[:3, :3] = np.asarray(extrinsics.rotation).reshape(3, 3).T
+    pose[:3, 3] = extrinsics.translation
+    return pose
 
 
 def _stream_image(stream: str, frame: Any, wanted: Callable[[str, int], bool]) -> StreamImage:

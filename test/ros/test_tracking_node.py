@@ -10,6 +10,7 @@ from data.textured_room import PERIOD_NS, frame_at, path
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy, qos_profile_sensor_data
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
@@ -190,6 +191,39 @@ def test_wheels_take_the_place_of_odometry_in_their_own_frames(start_node, clien
     assert edges == {("map", "wheels")}
     T_map_wheels = from_transform(transforms[-1].transforms[0].transform)
     assert np.linalg.norm((T_map_wheels @ T_wheels_map)[:3, 3]) < 0.1
+
+
+@pytest.mark.parametrize("topic", ["", "wheels/odom"])
+def test_odometry_that_is_started_again_is_no_motion(start_node, client, topic: str) -> None:
+    """A killed odometry node, and wheels whose driver is started again, begin at their origin."""
+    start_node(TrackingNode, **FAST | {"odometry_topic": topic})
+    camera = Camera(client)
+    camera.wait()
+    name = topic or topics.ODOMETRY
+
+    def odometry(numbers: range) -> Publisher:
+        publisher = client.node.create_publisher(Odometry, name, STREAM)
+        assert client.spin_until(lambda: publisher.get_subscription_count() == 1, ANSWER_S)
+        for number in numbers:
+            moved = inverse(POSES[numbers[0]]) @ POSES[number]
+            message = Odometry(child_frame_id=BASE_FRAME)
+            message.header.frame_id = "odom"
+            message.header.stamp = to_stamp(NANOSECONDS + number * PERIOD_NS)
+            message.pose.pose = to_pose(T_BODY_OPTICAL @ moved @ inverse(T_BODY_OPTICAL))
+            publisher.publish(message)
+        return publisher
+
+    first = odometry(range(6))
+    statuses = [camera.track(number) for number in range(6)]
+    client.node.destroy_publisher(first)
+    odometry(range(6, 10))
+    statuses += [camera.track(number) for number in range(6, 10)]
+    assert [status.odometry_valid for status in statuses] == [True] * 6 + [False] + [True] * 3
+    assert all(status.state == TrackingStatus.OK for status in statuses)
+    assert client.spin_until(lambda: len(client.poses) == 10, ANSWER_S)
+    for stamp, T_map_base in client.poses.items():
+        truth = POSES[(stamp - NANOSECONDS) // PERIOD_NS] @ inverse(T_BODY_OPTICAL)
+        assert np.linalg.norm((inverse(truth) @ T_map_base)[:3, 3]) < 0.015
 
 
 def test_wheels_that_nothing_connects_to_the_camera_are_named(start_node, client, capfd) -> None:

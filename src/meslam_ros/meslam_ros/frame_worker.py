@@ -80,10 +80,6 @@ class FrameWorker:
         losses[QUEUE_FULL] += self._queue.dropped
         return +losses
 
-    def clear(self) -> None:
-        """Forget what waits."""
-        self._queue.clear()
-
     def close(self) -> None:
         """Stop listening and wait for the frame under way."""
         self._stopping.set()

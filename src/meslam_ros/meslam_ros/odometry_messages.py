@@ -96,13 +96,25 @@ class OdometryBuffer:
         self._max_gap_ns = max_gap_ns
         self._stamps: list[int] = []
         self._messages: dict[int, Odometry] = {}
+        self._number = 0
+        self._began_ns: int | None = None
         self._changed = threading.Condition()
 
-    def add(self, message: Odometry) -> None:
-        """Keep a message; the oldest ones are forgotten."""
+    def add(self, message: Odometry, number: int = 0) -> None:
+        """Keep a message; the oldest ones are forgotten.
+
+        Args:
+            message: the next one.
+            number: of the message among its publisher's. Smaller than the last one's, it tells of
+                another publisher, whose poses have no connection to those before.
+        """
         stamp = stamp_ns(message.header.stamp)
         with self._changed:
-            if self._stamps and stamp < self._stamps[-1] - NANOSECONDS:
+            began = number < self._number
+            if began:
+                self._began_ns = stamp
+            self._number = number
+            if began or (self._stamps and stamp < self._stamps[-1] - NANOSECONDS):
                 self._stamps.clear()
                 self._messages.clear()
             if stamp not in self._messages:
@@ -113,11 +125,10 @@ class OdometryBuffer:
             del self._stamps[:-BUFFER_SIZE]
             self._changed.notify_all()
 
-    def clear(self) -> None:
-        """Forget everything."""
-        with self._changed:
-            self._stamps.clear()
-            self._messages.clear()
+    def began_anew(self, since_ns: int, until_ns: int) -> bool:
+        """Whether another publisher's first message lies between two stamps [ns]."""
+        began_ns = self._began_ns
+        return began_ns is not None and since_ns < began_ns <= until_ns
 
     def wait(self, stamp: int, timeout_s: float) -> tuple[Odometry, ...]:
         """What is known of a stamp [ns].

@@ -41,12 +41,13 @@ class OdometryNode(ManagedNode):
         self._config = read_config(self)
         self._check_method()
         limit_threads(self._config.runtime.threads)
-        self._publisher = self.create_publisher(Odometry, topics.ODOMETRY, STREAM)
         self._broadcaster = TransformBroadcaster(self)
         self._diagnostics = Diagnostics(self)
 
     def activate(self) -> None:
         self._begin()
+        # Another publisher tells those who listen that these poses do not continue earlier ones.
+        self._publisher = self.create_publisher(Odometry, topics.ODOMETRY, STREAM)
         self._worker = FrameWorker(
             self, self._inputs, self._frames, lambda: self._settings.odometry_queue_size, self
         )
@@ -55,11 +56,11 @@ class OdometryNode(ManagedNode):
     def deactivate(self) -> None:
         self.destroy_timer(self._timer)
         self._worker.close()
+        self.destroy_publisher(self._publisher)
 
     def cleanup(self) -> None:
         self._diagnostics.close()
         self._broadcaster.close()
-        self.destroy_publisher(self._publisher)
 
     def _check_method(self) -> None:
         if self._config.odometry.method == "none":

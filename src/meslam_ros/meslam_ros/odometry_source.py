@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -55,20 +56,39 @@ class OdometrySource:
         self._none = not topic and config.method == "none"
         gap_ns = round(config.given_gap_s * NANOSECONDS) if topic else MAX_GAP_NS
         self._buffer = OdometryBuffer(gap_ns)
+        self._last_ns: int | None = None
         self._subscription = node.create_subscription(
-            Odometry, topic or topics.ODOMETRY, self._buffer.add, GIVEN if topic else STREAM
+            Odometry, topic or topics.ODOMETRY, self._take, GIVEN if topic else STREAM
         )
+
+    def _take(self, message: Odometry, info: Mapping[str, Any]) -> None:
+        self._buffer.add(message, info["publication_sequence_number"] or 0)
 
     def estimate(
         self, frame: RgbdFrame, mount: CameraMount, transforms: StaticTransforms
     ) -> OdometryEstimate | None:
         """A frame's odometry, when it comes in time.
 
+        After its source was started again the first estimate is invalid: how the camera moved
+        from the last frame to this one is not known, only how it goes on from here.
+
         Args:
             frame: to know it of.
             mount: of the camera on the base.
             transforms: between the odometry's child frame and the camera.
         """
+        estimate = self._estimate(frame, mount, transforms)
+        if estimate is None:
+            return None
+        last_ns, self._last_ns = self._last_ns, frame.stamp_ns
+        if last_ns is None or not self._buffer.began_anew(last_ns, frame.stamp_ns):
+            return estimate
+        self._node.get_logger().warn("the odometry was started again: no motion to this image")
+        return replace(estimate, noise=None, valid=False, reason="the odometry was started again")
+
+    def _estimate(
+        self, frame: RgbdFrame, mount: CameraMount, transforms: StaticTransforms
+    ) -> OdometryEstimate | None:
         if self._none:
             return None
         log, topic = self._node.get_logger(), self._subscription.topic_name

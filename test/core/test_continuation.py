@@ -17,7 +17,7 @@ from meslam_core.map.store import MapStore
 from meslam_core.mapping.replay import remembered_views
 from meslam_core.pipeline import RunOptions, RunOutcome, run
 from meslam_core.se3 import exp, inverse, to_quaternion
-from meslam_core.slam import T_BODY_OPTICAL
+from meslam_core.slam import T_BODY_OPTICAL, Slam
 from meslam_core.trajectory import read_tum, write_tum
 
 START = 9
@@ -80,6 +80,42 @@ def test_what_only_the_first_session_saw_is_not_forgotten(second, stored, room_f
     ]
     assert np.isfinite(errors[1]).mean() > 0.95
     assert np.nanmedian(errors[1]) < np.nanmedian(errors[0]) + 0.005
+
+
+def test_localising_finds_poses_and_leaves_the_map_as_it_is(
+    stored, quick_config, room_frames, room_poses, tmp_path
+):
+    beside = room_poses[START] @ exp(np.array([0.01, 0.0, 0.005, 0.0, 0.017, 0.0]))
+    continuation = replace(Continuation.read(stored, beside), train=False)
+    options = RunOptions(continuation=continuation)
+    run(MemoryRecording(room_frames[START:]), quick_config, tmp_path, options)
+    trajectory = read_tum(tmp_path / "trajectory.txt")
+    assert len(trajectory) == len(room_poses) - START
+    for pose, truth in zip(trajectory.poses, room_poses[START:], strict=True):
+        assert np.linalg.norm((inverse(truth) @ pose)[:3, 3]) < 0.012
+    before, after = (MapStore(p).manifest().regions for p in (stored, tmp_path / "map.meslam"))
+    assert {e.sha256 for e in before} == {e.sha256 for e in after}
+
+
+def test_localising_follows_the_camera_from_region_to_region(stored, quick_config, tmp_path):
+    loaded = MapStore(stored).load()
+    regions = [replace(loaded.regions[0], version=1)]
+    T_map_beside = regions[0].T_map_region.copy()
+    T_map_beside[:3, 3] = loaded.grid.center((1, 0, 0))
+    regions.append(replace(regions[0], index=(1, 0, 0), T_map_region=T_map_beside))
+    MapStore(tmp_path / "map.meslam").save(regions, loaded.grid, "two")
+    continuation = replace(Continuation.read(tmp_path / "map.meslam", T_BODY_OPTICAL), train=False)
+    atlas = Slam(quick_config, continuation=continuation).atlas
+    middle = 0.5 * (loaded.grid.center((0, 0, 0)) + loaded.grid.center((1, 0, 0)))
+    forward = np.array([0.2, 0.0, 0.0])
+    assert atlas.working.index == (0, 0, 0)
+    assert not atlas.follow(middle)
+    assert atlas.follow(middle + forward)
+    assert atlas.working.index == (1, 0, 0)
+    assert atlas.regions[(0, 0, 0)].at_rest
+    assert not atlas.follow(middle + 20 * forward), "where no region is, the last one works on"
+    assert atlas.follow(middle - forward)
+    assert set(atlas.regions) == {(0, 0, 0), (1, 0, 0)}
 
 
 def test_remembered_views_lie_on_the_surface(stored, quick_config):

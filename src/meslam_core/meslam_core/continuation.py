@@ -22,8 +22,10 @@ from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose, from_quaternion
 from meslam_core.trajectory import read_tum
 
-# What stands for the old session's keyframes: so many views of a region.
+# What stands for the old session's keyframes: so many views of a region. Where nothing is trained
+# they are only what poses are given by.
 VIEWS_A_REGION = 24
+VIEWS_TO_LOCALISE = 1
 POSE_VALUES = 7
 
 
@@ -37,12 +39,14 @@ class Continuation:
         regions: what is stored, and the bytes that it is stored as.
         T_map_camera: (4, 4), where the camera is in it at first: within a few centimetres and
             degrees, which the first image then corrects.
+        train: whether the map is trained further; else poses are only found in it.
     """
 
     map_id: str
     grid: RegionGrid
     regions: list[tuple[StoredRegion, bytes]]
     T_map_camera: Pose
+    train: bool = True
 
     @classmethod
     def read(cls, path: Path, T_map_camera: Pose) -> Continuation:
@@ -108,9 +112,10 @@ class Continuation:
         """
         generator = np.random.default_rng(seed)
         regions = []
+        count = VIEWS_A_REGION if self.train else VIEWS_TO_LOCALISE
         for stored, data in self.regions:
             region = _awake(stored, data, config.field)
-            views = remembered_views(region, VIEWS_A_REGION, config.keyframes.rays, generator)
+            views = remembered_views(region, count, config.keyframes.rays, generator)
             for T_map_view, rays in views:
                 region.keyframes.append(keyframes.add(stored.stamp_ns, T_map_view, rays))
             region.rest(scratch)

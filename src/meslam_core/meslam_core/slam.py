@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from meslam_core.camera import T_BODY_OPTICAL
 from meslam_core.config import MeslamConfig
 from meslam_core.continuation import Continuation
 from meslam_core.field import field_device, make_field
@@ -32,12 +33,8 @@ from meslam_core.tracking.frame_tracking import FrameTracking, TrackedPose
 from meslam_core.tracking.pixels import TrustedPixels, trusted_pixels
 from meslam_core.trajectory import Trajectory
 
-__all__ = ["FrameResult", "Slam", "TrackingState"]
+__all__ = ["T_BODY_OPTICAL", "FrameResult", "Slam", "TrackingState"]
 
-# The first camera looks along the map's x axis and z points up (REP-103).
-T_BODY_OPTICAL: Pose = np.array(
-    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
 CURRENT_FRAME_RAYS = 4096
 MIN_FRAME_PIXELS = 200
 
@@ -71,7 +68,7 @@ class Slam:
             after `mapping.min_iterations` steps. A live system asks its queue; by default nothing
             waits, and every frame gets all its steps.
         continuation: a stored map to go on with, instead of an empty one; it tells where the
-            first frame is.
+            first frame is, and whether the map is trained further.
 
     Raises:
         MapError: when the map cannot be continued.
@@ -89,6 +86,7 @@ class Slam:
             config = continuation.adapted(config)
             T_map_camera = continuation.T_map_camera
         self.config = config
+        self._trains = continuation is None or continuation.train
         self.device = field_device(config.field)
         kept = config.keyframes
         self._scratch = ScratchFile(config.runtime.work_dir)
@@ -197,7 +195,10 @@ class Slam:
         elif trusted:
             # The keyframe that the pose was found by may have moved since.
             pose = self._history.keyframe_pose(pending.reference) @ pending.T_reference_camera
-            is_keyframe = self._begin_training(pending, orthonormalized(pose))
+            if self._trains:
+                is_keyframe = self._begin_training(pending, orthonormalized(pose))
+            else:
+                self._follow(pose)
         if self.atlas is not None:
             self._remember(pending, is_keyframe)
         return replace(
@@ -238,6 +239,8 @@ class Slam:
     @property
     def refining_steps(self) -> int:
         """How many steps a refinement of the whole map takes."""
+        if not self._trains:
+            return 0
         refinement = self._refinement
         return refinement.steps if refinement else self.config.mapping.final_iterations
 
@@ -251,7 +254,7 @@ class Slam:
     def settle(self) -> None:
         """Mark the observed space anew where the refined keyframes saw it."""
         self._finish_training()
-        if self._refinement is not None:
+        if self._refinement is not None and self._trains:
             self._refinement.rebuild_masks()
             self._look()
 
@@ -323,6 +326,12 @@ class Slam:
         self._look()
         self._training.start(current, pose, keyframe)
         return is_keyframe
+
+    def _follow(self, pose: Pose) -> None:
+        """Track in the region that the camera is in; nothing is trained."""
+        assert self.atlas is not None
+        if self.atlas.follow(pose[:3, 3]):
+            self._look()
 
     def _start(self, pending: _Pending) -> None:
         """The first frame defines the map frame and trains the first region from nothing."""

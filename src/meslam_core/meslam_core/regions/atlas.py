@@ -164,6 +164,27 @@ class RegionAtlas:
         region.wake()
         region.confirmed = True
 
+    def follow(self, position: NDArray[np.floating]) -> bool:
+        """Let the nearest of the regions there are work, in a map that is not trained.
+
+        Returns:
+            Whether that is another one.
+        """
+        centers = {
+            i: self._off_center(i, position) for i in self._about(self._on_lattice(position))
+        }
+        nearest = min(centers, key=centers.__getitem__, default=self._working)
+        margin = 2.0 * self.config.regions.hysteresis_m
+        if (
+            nearest == self._working
+            or centers[nearest] > self._off_center(self._working, position) - margin
+        ):
+            return False
+        self._working = nearest
+        self.working.wake()
+        self._rest_except([self.working])
+        return True
+
     def _about(self, on_lattice: NDArray[np.floating]) -> list[RegionIndex]:
         """Existing regions whose boxes may be near a position on the lattice (3,) [m]."""
         near = self.grid.containing(on_lattice, self.grid.spacing_m)

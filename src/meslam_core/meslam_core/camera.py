@@ -10,6 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meslam_core.errors import FrameError
+from meslam_core.se3 import Pose
+
+# A camera that looks along its body's x axis, z up (REP-103); so looks the first one of a map.
+T_BODY_OPTICAL: Pose = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 @dataclass(frozen=True)

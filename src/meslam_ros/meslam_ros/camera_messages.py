@@ -9,8 +9,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
 from meslam_core import se3
-from meslam_core.camera import PinholeCamera
-from meslam_core.slam import T_BODY_OPTICAL
+from meslam_core.camera import T_BODY_OPTICAL, PinholeCamera
 from meslam_ros.conversions import camera_to_info, image_message, to_stamp, to_transform
 from meslam_ros.realsense_camera import CameraImages
 

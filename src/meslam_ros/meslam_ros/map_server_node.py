@@ -50,7 +50,7 @@ class MapServerNode(ManagedNode):
 
     def configure(self) -> None:
         self._config = read_config(self)
-        limit_threads(self._config.runtime.threads)
+        limit_threads(self._config.runtime.threads, load_open3d=False)
         self._models = MapModels(self._config, self._frames.map_frame)
         self._keeper = MapKeeper(
             self._models, self._kept_folder, self._settings, self.get_logger().warn

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, Vector3
@@ -12,11 +13,13 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
-from meslam_core.map.surface import SurfacePoints
-from meslam_core.map.triangle_mesh import TriangleMesh
 from meslam_interfaces.msg import Region
 from meslam_ros.conversions import byte_array
 from meslam_ros.region_catalog import RegionEntry
+
+if TYPE_CHECKING:
+    from meslam_core.map.surface import SurfacePoints
+    from meslam_core.map.triangle_mesh import TriangleMesh
 
 BOXES, INTERSECTIONS, LABELS, MESHES = "regions", "intersections", "region_labels", "mesh"
 STATE_COLORS = {

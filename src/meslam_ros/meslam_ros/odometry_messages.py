@@ -10,8 +10,8 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 
 from meslam_core import se3
+from meslam_core.camera import T_BODY_OPTICAL
 from meslam_core.odometry import OdometryEstimate
-from meslam_core.slam import T_BODY_OPTICAL
 from meslam_ros.conversions import NANOSECONDS, from_pose, stamp_ns, to_pose, to_stamp
 from meslam_ros.transforms import CameraMount
 

@@ -40,7 +40,7 @@ class OdometryNode(ManagedNode):
     def configure(self) -> None:
         self._config = read_config(self)
         self._check_method()
-        limit_threads(self._config.runtime.threads)
+        limit_threads(self._config.runtime.threads, load_open3d=False)
         self._broadcaster = TransformBroadcaster(self)
         self._diagnostics = Diagnostics(self)
 

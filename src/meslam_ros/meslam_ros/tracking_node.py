@@ -56,7 +56,7 @@ class TrackingNode(ManagedNode):
 
     def configure(self) -> None:
         self._config = read_config(self)
-        limit_threads(self._config.runtime.threads)
+        limit_threads(self._config.runtime.threads, load_open3d=False)
         frames, settings = self._frames, self._settings
         self._pose = self.create_publisher(PoseStamped, topics.POSE, STREAM)
         self._covariance = self.create_publisher(

@@ -1,21 +1,28 @@
-"""The neural field of a region: embedding, network, sampling and volume rendering."""
+"""The neural field of a region: embedding, network, sampling and volume rendering.
+
+The compiled kernel in here serves odometry too, which needs no torch: so that is imported late.
+"""
 
 from __future__ import annotations
 
 import functools
 import logging
-
-import torch
+from typing import TYPE_CHECKING
 
 from meslam_core.config import FieldConfig
-from meslam_core.field.kernel import KernelField, unavailable_reason
-from meslam_core.field.model import FieldModel, TorchField
+
+if TYPE_CHECKING:
+    import torch
+
+    from meslam_core.field.model import FieldModel
 
 log = logging.getLogger(__name__)
 
 
 def field_device(config: FieldConfig) -> torch.device:
     """Where fields of this configuration are computed: a GPU where torch sees one."""
+    import torch
+
     if config.backend != "kernel" and torch.cuda.is_available():
         return torch.device("cuda")
     return torch.device("cpu")
@@ -27,6 +34,9 @@ def make_field(config: FieldConfig, seed: int) -> FieldModel:
     Raises:
         ConfigError: backend is 'kernel' and the compiled kernel cannot serve the configuration.
     """
+    from meslam_core.field.kernel import KernelField, unavailable_reason
+    from meslam_core.field.model import TorchField
+
     device = field_device(config)
     if config.backend == "kernel":
         return KernelField(config, seed)

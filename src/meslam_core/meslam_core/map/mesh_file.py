@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-import open3d as o3d
 
 from meslam_core.errors import OutputError
 from meslam_core.map.files import cannot_write, produce_atomically
 from meslam_core.map.triangle_mesh import TriangleMesh
+from meslam_core.threads import open3d as o3d
 
 if TYPE_CHECKING:
     from open3d.geometry import TriangleMesh as Open3dMesh

@@ -8,13 +8,13 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.config import OdometryConfig, SensorConfig
 from meslam_core.frame import RgbdFrame
 from meslam_core.se3 import Pose
+from meslam_core.threads import open3d as o3d
 
 # Coarse to fine; every level runs until it converges, because a few fixed steps from a bad
 # guess leave degrees of error under fast rotation.

@@ -1,13 +1,21 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from data.bag_builder import aligned_bag
+from data.image_folders import write_folder, write_tum
 from data.memory_recording import MemoryRecording
 from data.synthetic_frames import PERIOD_NS, cut, depth_mm, plane_frame, plane_frames
+from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
@@ -17,7 +25,7 @@ from meslam_core.camera import PinholeCamera
 from meslam_core.recordings import convert
 from meslam_core.slam import T_BODY_OPTICAL
 from meslam_interfaces.msg import TrackingStatus
-from meslam_ros import topics
+from meslam_ros import bag_player_node, topics
 from meslam_ros.bag_player_node import BagPlayerNode
 from meslam_ros.client import MeslamClient
 from meslam_ros.conversions import (
@@ -83,7 +91,9 @@ def test_what_was_recorded_is_what_is_seen(start_node, client, recording, encodi
         np.testing.assert_array_equal(seen_mm, depth_mm(frame))
         assert camera_from_info(info, "info") == frame.camera
     ticks = [stamp_ns(clock.clock) for clock in viewer.clock]
-    assert ticks == [frame.stamp_ns for frame in FRAMES][-len(ticks) :]
+    assert ticks == sorted(set(ticks))
+    assert FRAMES[0].stamp_ns <= ticks[0]
+    assert ticks[-1] == FRAMES[-1].stamp_ns
     mount = client.mount("camera_link", "camera_color_optical_frame")
     np.testing.assert_allclose(mount, T_BODY_OPTICAL, atol=1e-12)
 
@@ -178,23 +188,141 @@ def test_pause_and_loop(start_node, client, recording) -> None:
     assert stamp_ns(viewer.color[COUNT].header.stamp) == FRAMES[0].stamp_ns
 
 
-def image_folder(path: Path) -> Path:
-    """A recording that is only a folder of images."""
-    for name in ("color", "depth"):
-        (path / name).mkdir(parents=True)
-    (path / "camera.json").write_text(json.dumps({**FRAMES[0].camera.to_dict(), "fps": 20}))
-    for number, frame in enumerate(FRAMES[:3]):
-        cv2.imwrite(str(path / "color" / f"{number}.png"), frame.color[..., ::-1])
-        cv2.imwrite(str(path / "depth" / f"{number}.png"), depth_mm(frame))
+def test_clock_goes_on_between_the_images_and_rests_in_a_pause(
+    start_node, client, recording
+) -> None:
+    viewer = Viewer(client)
+    start_node(BagPlayerNode, recording=recording, rate=0.1)
+    assert client.spin_until(lambda: len(viewer.color) >= 2, WAIT_S)
+    ticks = [stamp_ns(clock.clock) for clock in viewer.clock]
+    steps = np.diff(ticks)
+    assert (steps > 0).all()
+    assert np.median(steps) < PERIOD_NS / 4
+    client.call(SetBool, "/bag_player_node/pause", SetBool.Request(data=True))
+    # The image that was waited for still comes.
+    client.spin_until(lambda: False, 1.0)
+    count = len(viewer.clock)
+    client.spin_until(lambda: False, 0.7)
+    assert len(viewer.clock) == count
+
+
+def test_rate_can_change_while_it_plays(start_node, client, recording) -> None:
+    viewer = Viewer(client)
+    player = start_node(BagPlayerNode, recording=recording, rate=0.05)
+    assert client.spin_until(lambda: len(viewer.color) >= 1, WAIT_S)
+    started = time.monotonic()
+    [result] = player.set_parameters([Parameter("rate", value=50.0)])
+    assert result.successful, result.reason
+    assert client.spin_until(lambda: len(viewer.color) == COUNT, WAIT_S)
+    assert time.monotonic() - started < 0.5 * COUNT * PERIOD_NS / NANOSECONDS / 0.05
+    [refused] = player.set_parameters([Parameter("rate", value=-1.0)])
+    assert not refused.successful
+
+
+def test_progress_is_shown(start_node, client, tmp_path, capfd, monkeypatch) -> None:
+    monkeypatch.setattr(bag_player_node, "PROGRESS_S", 0.2)
+    path = tmp_path / "plane.mcap"
+    convert(MemoryRecording(FRAMES), path)
+    Viewer(client)
+    player = start_node(BagPlayerNode, recording=str(path), rate=0.5)
+    ended: list[bool] = []
+    player.stop = lambda: ended.append(True)
+    assert client.spin_until(lambda: bool(ended), WAIT_S)
+    log = capfd.readouterr().err
+    assert re.search(r"\d+ %: [2-8] of 8 image pairs, 0\.\d of 0\.3 s", log), log
+    assert "played 8 image pairs" in log
+
+
+def test_playback_holds_for_a_subscriber_that_hangs(client, tmp_path) -> None:
+    """More images than the player keeps; none may be lost."""
+    count = 100
+    path = tmp_path / "long.mcap"
+    convert(MemoryRecording(plane_frames(count)), path)
+    listener = subprocess.Popen(
+        [sys.executable, "-c", LISTENER, str(count)], stdout=subprocess.PIPE, text=True
+    )
+    player = NodeProcess(
+        "bag_player_node",
+        ros_arguments({"recording": path, "rate": 5.0}),
+        log=tmp_path / "player.log",
+    )
+    try:
+        received = {int(listener.stdout.readline())}
+        listener.send_signal(signal.SIGSTOP)
+        assert client.spin_until(lambda: "waiting for it" in player.output(), WAIT_S)
+        listener.send_signal(signal.SIGCONT)
+        assert player.wait(WAIT_S) == 0, player.output()
+        received |= {int(line) for line in listener.communicate(timeout=WAIT_S)[0].split()}
+        assert received == {frame.stamp_ns for frame in plane_frames(count)}
+    finally:
+        listener.kill()
+        player.stop()
+
+
+LISTENER = """
+import sys, rclpy
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Image
+from meslam_ros import topics
+from meslam_ros.conversions import stamp_ns
+
+count, stamps = int(sys.argv[1]), []
+
+def take(message):
+    stamps.append(stamp_ns(message.header.stamp))
+    print(stamps[-1], flush=True)
+
+rclpy.init()
+node = rclpy.create_node("listener")
+profile = QoSProfile(depth=count)
+node.create_subscription(Image, topics.DEPTH, lambda _: None, profile)
+node.create_subscription(CameraInfo, topics.COLOR_INFO, lambda _: None, profile)
+node.create_subscription(Image, topics.COLOR, take, profile)
+while len(stamps) < count:
+    rclpy.spin_once(node, timeout_sec=1.0)
+"""
+
+
+def real_bag(name: str) -> Path:
+    path = Path(os.environ.get("MESLAM_DATA", ""), "realsense_recordings", name)
+    if not path.is_file():
+        pytest.skip("MESLAM_DATA names no folder of real recordings")
     return path
 
 
-def test_every_format_plays(start_node, client, tmp_path) -> None:
+@pytest.mark.parametrize("name", ["d435_sdk2.55.bag", "d435_sdk2.59.db3"])
+def test_librealsense_recordings_play(start_node, client, name) -> None:
     viewer = Viewer(client)
-    folder = image_folder(tmp_path / "folder")
-    start_node(BagPlayerNode, recording=str(folder), rate=10.0)
+    start_node(BagPlayerNode, recording=str(real_bag(name)), rate=5.0, frames=3)
     assert client.spin_until(lambda: viewer.counts == (3,) * 3, WAIT_S)
-    np.testing.assert_array_equal(color_image(viewer.color[1], "color"), FRAMES[1].color)
+    assert (depth_image(viewer.depth[0], "depth") > 0).mean() > 0.5
+
+
+def tum_folder(path: Path) -> Path:
+    folder = write_tum(path / "tum", FRAMES)
+    (folder / "camera.json").write_text(json.dumps(FRAMES[0].camera.to_dict()))
+    return folder
+
+
+FORMATS = {
+    "rosbag2 folder": lambda path: aligned_bag(FRAMES, path, "folder"),
+    "mcap": lambda path: aligned_bag(FRAMES, path, "mcap"),
+    "db3": lambda path: aligned_bag(FRAMES, path, "db3"),
+    "ROS 1 bag": lambda path: aligned_bag(FRAMES, path, "bag"),
+    "TUM": tum_folder,
+    "images": lambda path: write_folder(path / "images", FRAMES),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_plays(start_node, client, tmp_path, name) -> None:
+    viewer = Viewer(client)
+    start_node(BagPlayerNode, recording=str(FORMATS[name](tmp_path)), rate=10.0)
+    assert client.spin_until(lambda: viewer.counts == (COUNT,) * 3, WAIT_S)
+    for frame, color, depth in zip(FRAMES, viewer.color, viewer.depth, strict=True):
+        assert stamp_ns(color.header.stamp) == frame.stamp_ns
+        np.testing.assert_array_equal(color_image(color, "color"), frame.color)
+        np.testing.assert_allclose(depth_image(depth, "depth"), frame.depth_m, atol=6e-4)
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import queue
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +15,10 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import SetBool
 
+from meslam_core.camera import T_BODY_OPTICAL
 from meslam_core.errors import MeslamError, RecordingError
 from meslam_core.frame import RgbdFrame
 from meslam_core.recordings import open_recording
-from meslam_core.slam import T_BODY_OPTICAL
 from meslam_interfaces.msg import TrackingStatus
 from meslam_ros import topics
 from meslam_ros.conversions import (
@@ -33,13 +29,14 @@ from meslam_ros.conversions import (
     stamp_ns,
     to_stamp,
 )
+from meslam_ros.frame_reader import FrameReader
 from meslam_ros.managed_node import USAGE_ERROR, ManagedNode, run
 from meslam_ros.node_settings import PlayerSettings
 from meslam_ros.parameters import declare_settings
+from meslam_ros.playback_pace import Pace, Progress
 from meslam_ros.qos import STREAM, images
 from meslam_ros.transforms import StaticBroadcaster
 
-PREFETCHED_FRAMES = 4
 POLL_S = 0.02
 # Subscribers come one after another; when none has come for so long, all are there.
 SETTLING_S = 0.5
@@ -47,6 +44,9 @@ SETTLING_S = 0.5
 # three seconds at worst.
 IMAGE_DEPTH = 60
 LATE_S = 0.5
+CLOCK_PERIOD_S = 0.025
+PROGRESS_S = 5.0
+FIRST_REPORT_S = 1.0
 
 
 class PlaybackStoppedError(Exception):
@@ -64,9 +64,9 @@ class BagPlayerNode(ManagedNode):
         self.exit_code = USAGE_ERROR
         if not self._settings.recording:
             raise RecordingError("which recording? give -p recording:=PATH after --ros-args")
-        self._recording = open_recording(Path(self._settings.recording))
-        if len(self._recording) == 0:
-            raise RecordingError(f"{self._settings.recording} holds no image pair")
+        settings = self._settings
+        self._recording = open_recording(Path(settings.recording))
+        self._reader = FrameReader(self._recording, settings.start, settings.step, settings.frames)
         self.exit_code = 0
         profile = images(ReliabilityPolicy.RELIABLE, IMAGE_DEPTH)
         self._color = self.create_publisher(Image, topics.COLOR, profile)
@@ -75,11 +75,11 @@ class BagPlayerNode(ManagedNode):
         self._depth_info = self.create_publisher(CameraInfo, topics.DEPTH_INFO, profile)
         self._clock_publisher = self.create_publisher(Clock, topics.CLOCK, STREAM)
         self._publishers_of_images = (self._color, self._depth, self._color_info, self._depth_info)
-        if self._settings.base_frame:
-            T_base_optical = T_BODY_OPTICAL
-            self._static = StaticBroadcaster(
-                self, T_base_optical, self._settings.base_frame, self._settings.optical_frame
-            )
+        self._static = (
+            StaticBroadcaster(self, T_BODY_OPTICAL, settings.base_frame, settings.optical_frame)
+            if settings.base_frame
+            else None
+        )
         self._answers = threading.Condition()
         self._answered: set[int] = set()
         self._status = self.create_subscription(
@@ -102,6 +102,8 @@ class BagPlayerNode(ManagedNode):
         self._recording.close()
         self.destroy_service(self._pause)
         self.destroy_subscription(self._status)
+        if self._static is not None:
+            self._static.close()
         for publisher in (*self._publishers_of_images, self._clock_publisher):
             self.destroy_publisher(publisher)
 
@@ -120,39 +122,33 @@ class BagPlayerNode(ManagedNode):
         self.stop()
 
     def _wait_for_subscribers(self) -> None:
-        """Wait until both images have their subscribers and no more are coming."""
-        wanted = self._settings.subscribers
+        """Wait until all images have their subscribers and no more are coming."""
+        awaited = (self._color, self._depth, self._color_info)
         started = changed = time.monotonic()
-        seen: tuple[int, ...] = ()
-        announced = False
-        while wanted:
-            counted = (
-                self._color.get_subscription_count(),
-                self._depth.get_subscription_count(),
-                self._color_info.get_subscription_count(),
-            )
+        report_s = FIRST_REPORT_S
+        seen: list[int] = []
+        while wanted := self._settings.subscribers:
+            counted = [publisher.get_subscription_count() for publisher in awaited]
             now = time.monotonic()
             if counted != seen:
                 seen, changed = counted, now
             if min(counted) >= wanted and now - changed >= SETTLING_S:
                 return
-            if not announced and now - started > 1.0:
-                announced = True
-                self.get_logger().info(
-                    f"waiting for {wanted} subscribers of {self._color.topic_name} and "
-                    f"{self._depth.topic_name}"
-                )
-            if now - started > self._settings.wait_timeout_s:
+            have = ", ".join(f"{p.topic_name} {n}" for p, n in zip(awaited, counted, strict=True))
+            timeout_s = self._settings.wait_timeout_s
+            if now - started > timeout_s:
                 raise RecordingError(
-                    f"after {self._settings.wait_timeout_s:.0f} s {self._color.topic_name}, "
-                    f"{self._depth.topic_name} and {self._color_info.topic_name} have "
-                    f"{counted} subscribers, expected {wanted} each; are the nodes running, with "
-                    "the same ROS_DOMAIN_ID?"
+                    f"after {timeout_s:.0f} s not all have {wanted} subscribers: {have}; are the "
+                    "nodes running, with the same ROS_DOMAIN_ID? (subscribers:=0 does not wait)"
+                )
+            if min(counted) < wanted and now - started > report_s:
+                report_s *= 2.0
+                self.get_logger().info(
+                    f"waiting up to {timeout_s:.0f} s for {wanted} subscribers each: {have}"
                 )
             self._wait(POLL_S)
 
     def _play(self) -> None:
-        settings = self._settings
         while True:
             started = time.monotonic()
             count = self._play_once()
@@ -162,83 +158,45 @@ class BagPlayerNode(ManagedNode):
                 f"played {count} image pairs in {elapsed_s:.1f} s, "
                 f"{count / max(elapsed_s, 1e-3):.1f} a second"
             )
-            if not settings.loop:
+            if not self._settings.loop:
                 return
 
     def _play_once(self) -> int:
         """Play the recording to its end; returns the number of image pairs."""
         self._answered.clear()
+        self._clock_ns = self._unacknowledged = 0
         under_way: list[int] = []
-        first_ns, first_s, count = 0, 0.0, 0
-        late = False
-        for frame in self._frames():
-            while not self._running.is_set():
-                paused_s = time.monotonic()
-                self._wait(POLL_S)
-                first_s += time.monotonic() - paused_s
-            if self._settings.rate > 0:
-                if count == 0:
-                    first_ns, first_s = frame.stamp_ns, time.monotonic()
-                due_s = (frame.stamp_ns - first_ns) / NANOSECONDS / self._settings.rate + first_s
-                late = self._wait_until(due_s, late)
+        pace = Pace()
+        progress = Progress(len(self._reader), self._reader.duration_s, PROGRESS_S)
+        count, late = 0, False
+        for frame in self._reader.frames(self._wait):
+            pace.paused(self._wait_while_paused())
+            rate = self._settings.rate
+            due_s = pace.next(frame.stamp_ns, time.monotonic(), rate)
+            if rate > 0:
+                late = self._wait_until(due_s, frame.stamp_ns, rate, late)
             else:
                 self._wait_for_answers(under_way, self._settings.window - 1)
                 under_way.append(frame.stamp_ns)
+            self._wait_for_subscribers_to_follow()
             self._publish(frame)
             count += 1
+            if (report := progress.report(frame.stamp_ns, time.monotonic())) is not None:
+                self.get_logger().info(report)
         self._wait_for_answers(under_way, 0)
-        if count == 0:
-            raise RecordingError(
-                f"{self._settings.recording} has no image pair after start = "
-                f"{self._settings.start} s"
-            )
         return count
 
-    def _frames(self) -> Iterator[RgbdFrame]:
-        """Frames from the starting time on, decoded ahead by another thread."""
-        frames: queue.Queue[RgbdFrame | Exception | None] = queue.Queue(PREFETCHED_FRAMES)
-        thread = threading.Thread(target=self._decode, args=(frames,), daemon=True)
-        thread.start()
-        while True:
-            self._wait(0.0)
-            try:
-                frame = frames.get(timeout=POLL_S)
-            except queue.Empty:
-                continue
-            if isinstance(frame, Exception):
-                raise frame
-            if frame is None:
-                return
-            yield frame
-
-    def _decode(self, frames: queue.Queue[RgbdFrame | Exception | None]) -> None:
-        def put(entry: RgbdFrame | Exception | None) -> None:
-            while not self._stopping.is_set():
-                with suppress(queue.Full):
-                    frames.put(entry, timeout=POLL_S)
-                    return
-
-        try:
-            limit = self._settings.frames or None
-            for frame in islice(self._selected(), limit):
-                put(frame)
-                if self._stopping.is_set():
-                    return
-            put(None)
-        except Exception as error:
-            put(error)
-
-    def _selected(self) -> Iterator[RgbdFrame]:
-        first_ns: int | None = None
-        for frame in self._recording.frames(step=self._settings.step):
-            first_ns = frame.stamp_ns if first_ns is None else first_ns
-            if frame.stamp_ns - first_ns >= self._settings.start * NANOSECONDS:
-                yield frame
+    def _wait_while_paused(self) -> float:
+        """How long that took [s]."""
+        started = time.monotonic()
+        while not self._running.is_set():
+            self._wait(POLL_S)
+        return time.monotonic() - started
 
     def _publish(self, frame: RgbdFrame) -> None:
         stamp, name = to_stamp(frame.stamp_ns), self._settings.optical_frame
-        if self._settings.clock:
-            self._clock_publisher.publish(Clock(clock=stamp))
+        self._tick(frame.stamp_ns)
+        self._unacknowledged += 1
         info = camera_to_info(frame.camera, stamp, name)
         self._color_info.publish(info)
         self._depth_info.publish(info)
@@ -247,7 +205,13 @@ class BagPlayerNode(ManagedNode):
             depth_message(frame.depth_m, self._settings.depth_encoding, stamp, name)
         )
 
-    def _wait_until(self, due_s: float, late: bool) -> bool:
+    def _tick(self, now_ns: int) -> None:
+        """Tell the time, which never goes back within a recording."""
+        if self._settings.clock and now_ns > self._clock_ns:
+            self._clock_ns = now_ns
+            self._clock_publisher.publish(Clock(clock=to_stamp(now_ns)))
+
+    def _wait_until(self, due_s: float, stamp_ns: int, rate: float, late: bool) -> bool:
         """Wait for a frame's time; tells once when playback cannot keep its rate."""
         behind_s = time.monotonic() - due_s
         if behind_s > LATE_S and not late:
@@ -256,8 +220,20 @@ class BagPlayerNode(ManagedNode):
             )
             return True
         while (left_s := due_s - time.monotonic()) > 0:
-            self._wait(left_s)
+            if self._clock_ns:
+                self._tick(stamp_ns - round(left_s * rate * NANOSECONDS))
+            self._wait(min(left_s, CLOCK_PERIOD_S))
         return late
+
+    def _wait_for_subscribers_to_follow(self) -> None:
+        """Hold playback while somebody has not taken what can only just be sent again."""
+        pictures = (self._color, self._depth)
+        if all(publisher.wait_for_all_acked(Duration()) for publisher in pictures):
+            self._unacknowledged = 0
+        elif self._unacknowledged >= IMAGE_DEPTH - 1:
+            self.get_logger().warn("a subscriber does not take the images; waiting for it")
+            self._wait_for_acknowledgement()
+            self._unacknowledged = 0
 
     def _wait_for_answers(self, under_way: list[int], allowed: int) -> None:
         """Wait until at most so many image pairs have no answer yet."""
@@ -284,10 +260,17 @@ class BagPlayerNode(ManagedNode):
             self._answers.notify()
 
     def _wait_for_acknowledgement(self) -> None:
+        """Wait until all subscribers have taken all images; tells who has not."""
+        deadline = time.monotonic() + self._settings.wait_timeout_s
         for publisher in self._publishers_of_images:
-            timeout = Duration(seconds=self._settings.wait_timeout_s)
-            if not publisher.wait_for_all_acked(timeout):
-                self.get_logger().warn(f"{publisher.topic_name}: not all images were acknowledged")
+            while not publisher.wait_for_all_acked(Duration(seconds=POLL_S)):
+                self._wait(0.0)
+                if time.monotonic() > deadline:
+                    self.get_logger().warn(
+                        f"{publisher.topic_name}: a subscriber has not taken all images; it has "
+                        "lost some, or is about to"
+                    )
+                    break
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if request.data:

@@ -273,6 +273,7 @@ class PlayerSettings:
         "so that nothing is dropped however slow the computer is",
         minimum=0.0,
         maximum=100.0,
+        live=True,
     )
     window: int = setting(
         1,

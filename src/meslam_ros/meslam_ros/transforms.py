@@ -162,6 +162,11 @@ class StaticBroadcaster:
     """Publishes one fixed transform on /tf_static, for as long as it lives."""
 
     def __init__(self, node: Node, T_parent_child: se3.Pose, parent: str, child: str) -> None:
+        self._node = node
         self._publisher = node.create_publisher(TFMessage, topics.TF_STATIC, latched())
         transform = to_transform(T_parent_child, to_stamp(0), parent, child)
         self._publisher.publish(TFMessage(transforms=[transform]))
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._node.destroy_publisher(self._publisher)

@@ -30,7 +30,8 @@ class FrameResult:
     Attributes:
         stamp_ns: of the image [ns].
         T_map_camera: (4, 4) online pose.
-        covariance: (6, 6) of (translation [m], rotation [rad]), map axes.
+        covariance: (6, 6) of (translation [m], rotation [rad]) about the camera, map axes: how far
+            the pose may be off in the frame of the map's first pose, drift included.
         state, reason: of tracking.
         odometry: estimate it started from, if there was one.
         residual_m: median distance of the frame's points to the mapped surface [m].

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meslam_core.camera import T_BODY_OPTICAL
 from meslam_core.config import MeslamConfig
@@ -15,10 +16,11 @@ from meslam_core.field import field_device, make_field
 from meslam_core.frame import RgbdFrame
 from meslam_core.frame_result import FrameResult, TrackingState
 from meslam_core.loop.recognition import RegionRecogniser
-from meslam_core.mapping.frame_training import FrameTraining, NewKeyframe
+from meslam_core.mapping.frame_training import FrameTraining
 from meslam_core.mapping.joint_optimizer import JointOptimizer
 from meslam_core.mapping.keyframe_chain import KeyframeChain
 from meslam_core.mapping.keyframe_policy import KeyframePolicy
+from meslam_core.mapping.keyframe_registration import NewKeyframe
 from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
 from meslam_core.mapping.refinement import REFINING_STEPS, Refinement
 from meslam_core.mapping.training_worker import Training
@@ -30,6 +32,7 @@ from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.frame_history import KeyframePoses
 from meslam_core.tracking.frame_tracking import FrameTracking, TrackedPose
+from meslam_core.tracking.map_uncertainty import MapUncertainty
 from meslam_core.tracking.pixels import TrustedPixels, trusted_pixels
 from meslam_core.trajectory import Trajectory
 
@@ -98,6 +101,7 @@ class Slam:
         self.policy = KeyframePolicy(config.keyframes, config.field)
         self.tracking = FrameTracking(config.tracking, T_map_camera, config.relocalisation)
         self._history = self.tracking.history
+        self._map_uncertainty = MapUncertainty()
         self.atlas: RegionAtlas | None = None
         self._frames_wait = frames_wait
         self._seed = seed
@@ -115,6 +119,23 @@ class Slam:
             self._map_into(continuation.atlas(config, self.keyframes, seed, self._scratch))
             self.remembered = len(self.keyframes)
             self._look()
+            self._map_uncertainty.update(self.keyframes)
+
+    def begin_at(self, T_map_camera: Pose) -> None:
+        """Say where the first frame is in a stored map; for who learns it after having read that.
+
+        Args:
+            T_map_camera: (4, 4), as in `Continuation`.
+        """
+        assert self.atlas is not None, "only a stored map has places to begin at"
+        self.tracking = FrameTracking(
+            self.config.tracking, T_map_camera, self.config.relocalisation
+        )
+        self._history = self.tracking.history
+        self.atlas.take_over(
+            self.atlas.grid, list(self.atlas.regions.values()), T_map_camera[:3, 3]
+        )
+        self._look()
 
     @property
     def state(self) -> TrackingState:
@@ -161,7 +182,7 @@ class Slam:
         result = FrameResult(
             stamp_ns=frame.stamp_ns,
             T_map_camera=tracked.T_map_camera,
-            covariance=tracked.covariance,
+            covariance=self._covariance(tracked),
             state=self.state,
             reason=tracked.reason,
             odometry=odometry,
@@ -171,8 +192,7 @@ class Slam:
         )
         reference, relative = 0, np.eye(4)
         if self._view is not None:
-            newest = self._history.newest_keyframe
-            reference = newest if tracked.reference is None else tracked.reference
+            reference = self._reference(tracked)
             relative = inverse(self._history.keyframe_pose(reference)) @ tracked.T_map_camera
         self._pending = _Pending(
             frame, pixels, tracked, result, reference, orthonormalized(relative)
@@ -283,6 +303,19 @@ class Slam:
             self._look()
         return tracked
 
+    def _reference(self, tracked: TrackedPose) -> int:
+        """Number of the keyframe that a pose was found by."""
+        return self._history.newest_keyframe if tracked.reference is None else tracked.reference
+
+    def _covariance(self, tracked: TrackedPose) -> NDArray[np.float64]:
+        """Covariance (6, 6) of a pose: its place in the map, and the map's own error."""
+        if self._view is None:
+            return tracked.covariance
+        place = self._map_uncertainty.covariance(
+            tracked.T_map_camera[:3, 3], self._reference(tracked)
+        )
+        return tracked.covariance + place
+
     def _sample(self, frame: RgbdFrame, pixels: TrustedPixels, count: int) -> Rays:
         return rays_at(frame, *pixels.choose(count, self._generator))
 
@@ -292,6 +325,7 @@ class Slam:
             return Training()
         if self._training.wait():
             self._look()
+            self._map_uncertainty.update(self.keyframes)
         return self._training.latest
 
     def _look(self) -> None:

@@ -130,7 +130,11 @@ class RosLogHandler(logging.Handler):
 
 def run(make_node: Callable[[], ManagedNode], executor_threads: int = 1) -> int:
     """Spin a node until a signal or the node itself ends it; returns the exit status."""
-    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        print(f"error: the ROS arguments cannot be used: {error}", file=sys.stderr)
+        return USAGE_ERROR
     executor: Executor = (
         SingleThreadedExecutor()
         if executor_threads == 1

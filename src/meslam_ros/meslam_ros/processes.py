@@ -18,9 +18,17 @@ def ros_arguments(parameters: Mapping[str, Any], extra: Sequence[str] = ()) -> l
     """Command-line arguments that set parameters; `extra` follows, such as remappings."""
     arguments = ["--ros-args"]
     for name, value in parameters.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        arguments += ["-p", f"{name}:={text}"]
+        arguments += ["-p", f"{name}:={_yaml(value)}"]
     return [*arguments, *extra] if parameters or extra else []
+
+
+def _yaml(value: Any) -> str:
+    """A value as YAML; texts are quoted, for they may be empty or look like numbers."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (int, float)):
+        return str(value)
+    return "'" + str(value).replace("'", "''") + "'"
 
 
 class NodeProcess:

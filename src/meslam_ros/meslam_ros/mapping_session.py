@@ -9,6 +9,7 @@ from contextlib import contextmanager, nullcontext
 
 from meslam_core import se3
 from meslam_core.config import MeslamConfig
+from meslam_core.continuation import Continuation
 from meslam_core.frame import RgbdFrame
 from meslam_core.mapping.refinement import REFINING_STEPS
 from meslam_core.odometry import OdometryEstimate
@@ -23,7 +24,9 @@ WITH_POSE = (TrackingState.OK, TrackingState.DEGRADED)
 
 
 class MappingSession:
-    """From an empty map to a reset. The map frame is where the first base was.
+    """From an empty map, or a stored one, to a reset.
+
+    The map frame of a new map is where the first base was.
 
     Every frame takes three steps: `track`, `wait`, `map`. Training runs beside them from one `map`
     to the next `wait`; only between `wait` and `map` do the regions keep still.
@@ -33,9 +36,14 @@ class MappingSession:
         seed: of every random choice.
         frames_wait: whether frames wait to be tracked, asked by the training thread; while they
             do and training holds them up, it gives way.
+        continuation: a stored map to go on with; making the session then takes a while.
+
+    Raises:
+        MapError: when the map cannot be gone on with.
 
     Attributes:
-        map_id: identifies the map.
+        map_id: identifies the map; a stored one keeps its own.
+        continuation: the stored map, if there is one.
         received, tracked: frames so far, and those with a pose.
         discarded: frames that were not processed, by reason.
         result: of the latest frame.
@@ -43,9 +51,14 @@ class MappingSession:
     """
 
     def __init__(
-        self, config: MeslamConfig, seed: int, frames_wait: Callable[[], bool] = lambda: False
+        self,
+        config: MeslamConfig,
+        seed: int,
+        frames_wait: Callable[[], bool] = lambda: False,
+        continuation: Continuation | None = None,
     ) -> None:
-        self.map_id = uuid.uuid4().hex
+        self.map_id = continuation.map_id if continuation else uuid.uuid4().hex
+        self.continuation = continuation
         self.received = 0
         self.tracked = 0
         self.discarded: Counter[str] = Counter()
@@ -57,7 +70,16 @@ class MappingSession:
         self._held_up = False
         self._slam: Slam | None = None
         self._mount: CameraMount | None = None
+        self._start: se3.Pose | None = None
         self._refined_steps = 0
+        if continuation is not None:
+            self._slam = Slam(
+                config, seed, frames_wait=self._must_give_way, continuation=continuation
+            )
+
+    def begin_at(self, T_map_base: se3.Pose | None) -> None:
+        """Say where the base is in a stored map, (4, 4) [m]; None for where its mapping began."""
+        self._start = T_map_base
 
     def track(
         self, frame: RgbdFrame, mount: CameraMount, odometry: OdometryEstimate | None
@@ -69,15 +91,30 @@ class MappingSession:
             mount: of the camera on the base.
             odometry: of the frame, where there is one.
         """
-        if self._slam is None:
-            T_map_camera = first_base_pose(mount) @ mount.T_base_optical
-            self._slam = Slam(self._config, self._seed, T_map_camera, self._must_give_way)
-            self._mount = mount
+        if self._mount is None:
+            self._begin(mount)
+        assert self._slam is not None
         self.received += 1
         self._refined_steps = 0
         self.result = self._slam.track(frame, odometry)
         self.tracked += self.has_pose
         return self.result
+
+    def again(self) -> MappingSession:
+        """The same from its beginning; a stored map as it was stored."""
+        session = MappingSession(self._config, self._seed, self._frames_wait, self.continuation)
+        session.begin_at(self._start)
+        return session
+
+    def _begin(self, mount: CameraMount) -> None:
+        """The first frame has come, and so it is known where the camera sits."""
+        T_map_base = first_base_pose(mount) if self._start is None else self._start
+        T_map_camera = T_map_base @ mount.T_base_optical
+        if self._slam is None:
+            self._slam = Slam(self._config, self._seed, T_map_camera, self._must_give_way)
+        else:
+            self._slam.begin_at(T_map_camera)
+        self._mount = mount
 
     def wait(self) -> None:
         """Wait until the frames before are mapped; afterwards the regions keep still."""
@@ -127,6 +164,18 @@ class MappingSession:
     def has_pose(self) -> bool:
         """Whether the latest frame has a pose that is worth publishing."""
         return self.result is not None and self.result.state in WITH_POSE
+
+    @property
+    def localises(self) -> bool:
+        """Whether the map is left as it is."""
+        return self.continuation is not None and not self.continuation.train
+
+    @property
+    def T_map_base(self) -> se3.Pose | None:
+        """Pose (4, 4) of the base at the latest frame [m]; None where that has none."""
+        if self.result is None or not self.has_pose:
+            return None
+        return self.result.T_map_camera @ self.T_camera_base
 
     @property
     def T_camera_base(self) -> se3.Pose:

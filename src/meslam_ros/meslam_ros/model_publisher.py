@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from meslam_core.errors import MapError
+from meslam_core.map.codec import decode
 from meslam_core.map.stored_region import StoredRegion, snapshot
 from meslam_core.regions.grid import RegionIndex
 from meslam_core.regions.region import Region
@@ -81,7 +82,7 @@ class ModelPublisher:
             due = final or now - offered_s >= self._period_s()
             if region.version != version and due:
                 self._offered[region.index] = region.version, now
-                stored = snapshot(region, stamp_ns)
+                stored = _stored(region, stamp_ns)
                 with self._changed:
                     self._waiting[region.index] = self._map_id, stored
                     self._changed.notify_all()
@@ -129,3 +130,10 @@ class ModelPublisher:
                 )
             self._bytes[index] = len(message.data)
             self._publishers[index].publish(message)
+
+
+def _stored(region: Region, stamp_ns: int) -> StoredRegion:
+    """A region as it is now; as it was stored where an earlier session did and nothing changed."""
+    if region.origin is not None and region.untouched:
+        return decode(region.origin.data)
+    return snapshot(region, stamp_ns)

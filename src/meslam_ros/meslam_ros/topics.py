@@ -26,6 +26,8 @@ OCCUPANCY_GRID = "meslam/occupancy_grid"
 
 RESET = "meslam/reset"
 PAUSE = "meslam/pause"
+USE_MAP = "meslam/use_map"
+EXPORT = "meslam/export"
 EXPORT_MAP = "meslam/export_map"
 GET_MESH = "meslam/get_mesh"
 QUERY_OCCUPANCY = "meslam/query_occupancy"

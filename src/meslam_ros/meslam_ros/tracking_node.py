@@ -12,13 +12,16 @@ from std_srvs.srv import SetBool, Trigger
 
 from meslam_core import se3
 from meslam_core.config import MeslamConfig
+from meslam_core.errors import FrameError, MapError
 from meslam_core.frame import RgbdFrame
 from meslam_core.slam import FrameResult, TrackingState
 from meslam_core.threads import limit_threads
 from meslam_interfaces.msg import RegionIndex, TrackingStatus
+from meslam_interfaces.srv import UseMap
 from meslam_ros import topics
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
 from meslam_ros.frame_worker import FrameWorker
+from meslam_ros.given_map import GivenMap, Preparation
 from meslam_ros.image_synchronizer import ImagePair
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.map_to_odom import MapToOdom
@@ -80,6 +83,8 @@ class TrackingNode(ManagedNode):
         )
         self._reset = self.create_service(Trigger, topics.RESET, self._on_reset)
         self._pause = self.create_service(SetBool, topics.PAUSE, self._on_pause)
+        self._use = self.create_service(UseMap, topics.USE_MAP, self._on_use_map)
+        self._given: Preparation | None = None
         self._paused = False
         self._reset_requested = False
         self._begin()
@@ -100,37 +105,58 @@ class TrackingNode(ManagedNode):
         self._map_to_odom.close()
         self._diagnostics.close()
         self._odometry.close()
-        for service in (self._reset, self._pause):
+        for service in (self._reset, self._pause, self._use):
             self.destroy_service(service)
         for publisher in (self._pose, self._covariance, self._path, self._status):
             self.destroy_publisher(publisher)
 
-    def _begin(self) -> None:
-        """Start with an empty map."""
-        self._session = MappingSession(self._config, self._settings.seed, self._frames_wait)
+    def _begin(self, session: MappingSession | None = None) -> None:
+        """Start with an empty map, or with the one of a session."""
+        self._session = session or self._make_session()
         self._reset_requested = False
         self._all_published = True
         self._path_due_s = 0.0
         self._models.begin(self._session.map_id)
         self._map_to_odom.reset()
 
-    def _begin_anew(self) -> None:
+    def _begin_anew(self, session: MappingSession | None = None) -> None:
         """Give up the map; what still trains it comes to its end first."""
         self._session.wait()
-        self._begin()
+        self._begin(session)
+
+    def _make_session(self, given: GivenMap | None = None) -> MappingSession:
+        continuation = given.continuation if given else None
+        return MappingSession(self._config, self._settings.seed, self._frames_wait, continuation)
+
+    def _take_given(self) -> None:
+        """Go over to a given map that is ready."""
+        given = self._given
+        if given is None or not given.ended:
+            return
+        self._given = None
+        session = given.session(self._session.T_map_base)
+        if session is None:
+            self.get_logger().error(f"the given map cannot be used: {given.error}")
+            return
+        self._begin_anew(session)
+        doing = "poses are found in" if session.localises else "mapping goes on in"
+        self.get_logger().info(f"{doing} the stored map {session.map_id}")
 
     def _frames_wait(self) -> bool:
         return self._settings.give_way and self._worker.waiting > 0
 
     def restart(self, reason: str) -> None:
-        """Begin a new map (`FrameConsumer`)."""
-        self.get_logger().warn(f"{reason}; a new map begins")
-        self._begin_anew()
+        """Begin a new map, or anew in one that is not trained (`FrameConsumer`)."""
+        localised = self._session if self._session.localises else None
+        begins = "localisation begins anew" if localised else "a new map begins"
+        self.get_logger().warn(f"{reason}; {begins}")
+        self._begin_anew(localised.again() if localised else None)
 
     def process(self, frame: RgbdFrame, mount: CameraMount, pair: ImagePair) -> None:
         """Track, map and publish one frame (`FrameConsumer`)."""
         if self._reset_requested:
             self._begin_anew()
+        self._take_given()
         session = self._session
         if self._paused:
             session.discarded["paused"] += 1
@@ -165,6 +191,7 @@ class TrackingNode(ManagedNode):
         """Refine the map, then publish what the bounded rates held back (`FrameConsumer`)."""
         if self._reset_requested:
             self._begin_anew()
+        self._take_given()
         if self._all_published or silence_s < self._settings.idle_s:
             return
         if self._session.refine():
@@ -208,6 +235,7 @@ class TrackingNode(ManagedNode):
         status.drop_reasons = counts(dropped)
         status.queue_length = self._worker.waiting
         status.paused = self._paused
+        status.localising = session.localises
         self._latest_status = status
         self._status.publish(status)
 
@@ -222,8 +250,28 @@ class TrackingNode(ManagedNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._reset_requested = True
+        self._given = None
         response.success = True
         response.message = "the map is forgotten; a new one begins with the next image"
+        self.get_logger().info(response.message)
+        return response
+
+    def _on_use_map(self, request: UseMap.Request, response: UseMap.Response) -> UseMap.Response:
+        try:
+            given = GivenMap.of(request, self._config)
+        except FrameError as error:
+            response.result, response.message = response.INVALID_REQUEST, str(error)
+            return response
+        except MapError as error:
+            response.result, response.message = response.INVALID_DATA, str(error)
+            return response
+        session = self._session
+        self._given = Preparation(given, self._make_session, session.T_map_base, session.map_id)
+        response.result = response.SUCCESS
+        response.message = (
+            f"tracking goes over to the map {given.map_id} when it is ready; the map_id in "
+            f"{topics.STATUS} tells"
+        )
         self.get_logger().info(response.message)
         return response
 

@@ -49,7 +49,8 @@ class Mapper:
         frame = frame_at(pose, number, LARGE)
         rays = rays_at(frame, *choose_pixels(frame.depth_m > 0, 512, self._generator))
         self.keyframes.add(frame.stamp_ns, pose if believed is None else believed, rays)
-        return self.linker.link(number, frame, rays)
+        self.linker.keep(number, frame)
+        return [link for link in self.linker.link(number, frame.camera, rays) if link is not None]
 
     def add_all(self, poses: Sequence[Pose]) -> None:
         for pose in poses:

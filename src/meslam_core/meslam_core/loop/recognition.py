@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 
 import numpy as np
 
-from meslam_core.frame import RgbdFrame
+from meslam_core.camera import PinholeCamera
 from meslam_core.loop.pose_graph import optimised_poses
 from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.keyframe_links import MeasuredMotion
@@ -46,26 +47,32 @@ class RegionRecogniser:
         self._keyframes = atlas.keyframes
         self._linker = linker
 
-    def ask(self, region: Region, keyframe: int, frame: RgbdFrame, rays: Rays) -> None:
-        """Look for a new keyframe's view among those of a region that woke.
+    def ask(
+        self, region: Region, keyframe: int, camera: PinholeCamera, rays: Rays
+    ) -> Iterator[None]:
+        """Look for a keyframe's view among those of a region that woke, a registration at a time.
 
         Args:
             region: awake and not confirmed.
-            keyframe: number of the new one.
-            frame: its images.
+            keyframe: number of one whose images are kept.
+            camera: of its frame.
             rays: its sample, camera frame.
         """
-        region.doubts += 1
-        if region.doubts > MANY_DOUBTS and region.doubts % THEN_EVERY:
+        doubts = region.doubts + 1
+        if doubts > MANY_DOUBTS and doubts % THEN_EVERY:
+            region.doubts = doubts
             return
-        links = self._linker.recognise(keyframe, frame, rays, range(region.known_until))
-        if links is None:
-            # The camera has yet to come to what was seen.
-            region.doubts -= 1
-            return
-        if links:
-            self._believe(links)
-            region.confirmed = True
+        among = range(region.known_until)
+        # Where no registration is made, the camera has yet to come to what was seen.
+        for links in self._linker.recognise(keyframe, camera, rays, among):
+            region.doubts = doubts
+            if region.confirmed:
+                return
+            if links:
+                self._believe(links)
+                region.confirmed = True
+                return
+            yield
 
     def _believe(self, links: list[MeasuredMotion]) -> None:
         keyframes = self._keyframes

@@ -6,7 +6,7 @@ again what an older one saw is registered with it directly.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
@@ -29,7 +29,6 @@ from meslam_core.se3 import Pose, inverse, rotation_angle
 JUDGED_POINTS = 64
 MIN_OVERLAP = 0.5
 ATTEMPTS_A_LINK = 2
-LEAST_ATTEMPTS = 3
 # So many older keyframes stay ready: the next keyframe is mostly linked to the same ones.
 READY_KEYFRAMES = 8
 MIN_FITNESS = 0.6
@@ -73,72 +72,72 @@ class CovisibilityLinker:
         self._images = KeyframeImages(scratch)
         self._ready = lru_cache(maxsize=READY_KEYFRAMES)(self._prepare_older)
 
+    def keep(self, keyframe: int, frame: RgbdFrame) -> None:
+        """Keep a new keyframe's images: it can be linked from now on, and to."""
+        self._images.add(keyframe, self.image(frame))
+
     def link(
-        self,
-        keyframe: int,
-        frame: RgbdFrame,
-        rays: Rays,
-        frames_wait: Callable[[], bool] = lambda: False,
-    ) -> list[MeasuredMotion]:
-        """Register a new keyframe with up to `config.links` older ones.
+        self, keyframe: int, camera: PinholeCamera, rays: Rays
+    ) -> Iterator[MeasuredMotion | None]:
+        """Register a keyframe with up to `config.links` older ones, one at a time.
 
         Args:
-            keyframe: number of the new one.
-            frame: its images; they are kept for keyframes to come.
+            keyframe: number of one that is kept.
+            camera: of its frame.
             rays: its sample, camera frame.
-            frames_wait: while they do, no more than `LEAST_ATTEMPTS` registrations are made.
+
+        Yields:
+            After every registration the link that it found, or None.
         """
-        image = self.image(frame)
-        older = islice(
-            self._candidates(keyframe, frame.camera, rays), ATTEMPTS_A_LINK * self._links
-        )
-        links = self._register_all(keyframe, image, older, frames_wait)
-        self._images.add(keyframe, image)
-        return links
+        prepared = self._ready(keyframe)
+        links = 0
+        candidates = self._candidates(keyframe, camera, rays)
+        for older in islice(candidates, ATTEMPTS_A_LINK * self._links):
+            if links >= self._links:
+                return
+            link = self._register(older, keyframe, prepared)
+            links += link is not None
+            yield link
 
     def recognise(
-        self, keyframe: int, frame: RgbdFrame, rays: Rays, among: Sequence[int]
-    ) -> list[MeasuredMotion] | None:
-        """Where a new keyframe is among older ones, however far off its pose is believed to be.
+        self, keyframe: int, camera: PinholeCamera, rays: Rays, among: Sequence[int]
+    ) -> Iterator[list[MeasuredMotion]]:
+        """Where a keyframe is among older ones, however far off its pose is believed to be.
 
         Args:
-            keyframe: number of the new one.
-            frame: its images.
+            keyframe: number of one that is kept.
+            camera: of its frame.
             rays: its sample, camera frame.
             among: older keyframes.
 
-        Returns:
-            Links that agree with each other; none where the place is not recognised for certain,
-            and None where no older keyframe can have seen it.
+        Yields:
+            After every registration links that agree with each other, the last of which did so;
+            none while the place is not recognised for certain. Ends at once where no older
+            keyframe can have seen it.
         """
         known = np.intersect1d(np.array(among, np.int64), self._images.numbers)
-        overlaps = self._overlaps(keyframe, frame.camera, rays, known)
+        overlaps = self._overlaps(keyframe, camera, rays, known)
         shared = [k for k, overlap in overlaps if overlap > MIN_RECOGNISED_OVERLAP]
-        if not shared:
-            return None
-        prepared = self.prepare(self.image(frame))
         links: list[MeasuredMotion] = []
         for other in shared[:RECOGNITION_ATTEMPTS]:
             guess = inverse(self._keyframes.pose(other)) @ self._keyframes.pose(keyframe)
-            found = self.find(other, prepared, guess)
-            if found is None:
-                continue
-            link = MeasuredMotion(other, keyframe, found.T_target_source)
-            alike = [each for each in links if self._agree(each, link)]
-            if len(alike) + 1 >= RECOGNISING:
-                return [*alike, link]
-            links.append(link)
-        return []
+            found = self.find(other, self._ready(keyframe), guess)
+            alike: list[MeasuredMotion] = []
+            if found is not None:
+                link = MeasuredMotion(other, keyframe, found.T_target_source)
+                alike = [each for each in links if self._agree(each, link)]
+                links.append(link)
+            yield [*alike, links[-1]] if len(alike) + 1 >= RECOGNISING else []
 
     def image(self, frame: RgbdFrame) -> KeyframeImage:
         """What is kept of a frame that becomes a keyframe."""
         return KeyframeImage.of(frame, self._width)
 
     def image_of(self, keyframe: int) -> KeyframeImage:
-        """What is kept of a keyframe that was linked.
+        """What is kept of a keyframe that is kept.
 
         Raises:
-            KeyError: it was not.
+            KeyError: it is not.
             OutputError: when the disk fails.
         """
         return self._images.get(keyframe)
@@ -151,7 +150,7 @@ class CovisibilityLinker:
         """Where a view is in a keyframe, if a good fit tells; else None.
 
         Args:
-            older: a keyframe that was linked.
+            older: a keyframe that is kept.
             prepared: the view.
             guess: T_older_view (4, 4), which may be far off: features propose others.
         """
@@ -180,25 +179,8 @@ class CovisibilityLinker:
         near = float(np.linalg.norm(apart[:3, 3])) < SAME_PLACE_M
         return near and rotation_angle(apart) < SAME_PLACE_RAD
 
-    def _register_all(
-        self,
-        keyframe: int,
-        image: KeyframeImage,
-        others: Iterable[int],
-        frames_wait: Callable[[], bool] = lambda: False,
-    ) -> list[MeasuredMotion]:
-        links: list[MeasuredMotion] = []
-        prepared = self.prepare(image)
-        for attempt, other in enumerate(others):
-            if len(links) >= self._links or (attempt >= LEAST_ATTEMPTS and frames_wait()):
-                break
-            T_other_keyframe = self._register(other, keyframe, prepared)
-            if T_other_keyframe is not None:
-                links.append(MeasuredMotion(other, keyframe, T_other_keyframe))
-        return links
-
-    def _register(self, older: int, keyframe: int, prepared: object) -> Pose | None:
-        """T_older_new (4, 4) where the two fit; None where not."""
+    def _register(self, older: int, keyframe: int, prepared: Any) -> MeasuredMotion | None:
+        """The link of two keyframes where they fit; None where not."""
         guess = inverse(self._keyframes.pose(older)) @ self._keyframes.pose(keyframe)
         target = self._ready(older)
         try:
@@ -210,11 +192,12 @@ class CovisibilityLinker:
         correction = inverse(guess) @ found.T_target_source
         far = float(np.linalg.norm(correction[:3, 3])) > MAX_CORRECTION_M
         turned = rotation_angle(correction) > MAX_CORRECTION_RAD
-        return None if far or turned else found.T_target_source
+        return None if far or turned else MeasuredMotion(older, keyframe, found.T_target_source)
 
     def _candidates(self, keyframe: int, camera: PinholeCamera, rays: Rays) -> Iterator[int]:
         """Keyframes that share the view: those that share most and the oldest in turn."""
-        overlaps = self._overlaps(keyframe, camera, rays, self._images.numbers)
+        kept = self._images.numbers
+        overlaps = self._overlaps(keyframe, camera, rays, kept[kept < keyframe])
         best = [number for number, overlap in overlaps if overlap > MIN_OVERLAP]
         given: set[int] = set()
         for two in zip(best, sorted(best), strict=True):

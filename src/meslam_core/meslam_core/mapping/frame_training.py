@@ -8,11 +8,10 @@ from collections.abc import Callable
 from functools import partial
 
 from meslam_core.config import MeslamConfig
-from meslam_core.frame import RgbdFrame
 from meslam_core.loop.recognition import RegionRecogniser
 from meslam_core.loop.relocalisation import Relocaliser
-from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.joint_optimizer import JointOptimizer
+from meslam_core.mapping.keyframe_registration import KeyframeRegistration, NewKeyframe
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.mapping.training_worker import Training, TrainingWorker
 from meslam_core.regions.atlas import RegionAtlas
@@ -24,9 +23,6 @@ from meslam_core.se3 import Pose
 # frames make up for the rest, so many steps each.
 FIRST_STEPS_SHARE = 0.4
 MADE_UP_A_FRAME = 40
-
-# A new keyframe: its number, its images and its sample of rays, camera frame.
-NewKeyframe = tuple[int, RgbdFrame, Rays]
 
 
 class FrameTraining:
@@ -44,8 +40,6 @@ class FrameTraining:
 
     Attributes:
         latest: what the latest training did that was waited for.
-        recogniser: asks regions that woke, where loops are closed.
-        relocaliser: finds a lost camera, while no training runs.
     """
 
     def __init__(
@@ -57,22 +51,25 @@ class FrameTraining:
         frames_wait: Callable[[], bool],
     ) -> None:
         self.latest = Training()
-        self.recogniser: RegionRecogniser | None = None
         self._config = config.mapping
         self._atlas = atlas
-        self._keyframes = atlas.keyframes
         self._optimizer = optimizer
         self._frames_wait = frames_wait
         self._worker = TrainingWorker()
         self._trained: list[Region] = []
         self._steps_owed = 0
         self._turn = 0
-        self._linker: CovisibilityLinker | None = None
-        if config.keyframes.links:
-            self._linker = CovisibilityLinker(self._keyframes, config, scratch)
-            if config.regions.close_loops:
-                self.recogniser = RegionRecogniser(atlas, self._linker)
-        self.relocaliser = Relocaliser(config.relocalisation, config.tracking, atlas, self._linker)
+        self._registration = KeyframeRegistration(config, atlas, scratch, frames_wait)
+
+    @property
+    def recogniser(self) -> RegionRecogniser | None:
+        """Asks regions that woke, where loops are closed."""
+        return self._registration.recogniser
+
+    @property
+    def relocaliser(self) -> Relocaliser:
+        """Finds a lost camera, while no training runs."""
+        return self._registration.relocaliser
 
     def start_first(self) -> None:
         """Begin to train the first region from nothing, with the first keyframe."""
@@ -128,8 +125,9 @@ class FrameTraining:
         """Train the working region, which comes first, and the other one half as long."""
         started = time.perf_counter()
         self._atlas.settle()
-        if keyframe is not None and self._register(keyframe):
-            pose = self._keyframes.pose(keyframe[0])
+        if keyframe is not None:
+            self._registration.add(keyframe)
+        pose = self._registration.proceed() @ pose
         least = self._config.min_iterations
         losses = self._optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
@@ -155,20 +153,6 @@ class FrameTraining:
             enough=partial(self._may_end, least),
         )
         return Training(losses, (time.perf_counter() - started) * 1e3)
-
-    def _register(self, keyframe: NewKeyframe) -> bool:
-        """Tie a new keyframe to older ones; whether that corrected the path it is on."""
-        if self._linker is None:
-            return False
-        for link in self._linker.link(*keyframe, self._frames_wait):
-            self._keyframes.add_link(link.first, link.second, link.T_first_second)
-        self.relocaliser.remember(keyframe[0])
-        if self.recogniser is None:
-            return False
-        corrections = self.recogniser.corrections
-        for region in self._atlas.doubtful[:1]:
-            self.recogniser.ask(region, *keyframe)
-        return self.recogniser.corrections > corrections
 
     def _may_end(self, least: int, done: int) -> bool:
         return done >= least and self._frames_wait()

@@ -1,0 +1,105 @@
+"""What ties new keyframes to older ones, and recognises the places of before."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from meslam_core.camera import PinholeCamera
+from meslam_core.config import MeslamConfig
+from meslam_core.frame import RgbdFrame
+from meslam_core.loop.recognition import RegionRecogniser
+from meslam_core.loop.relocalisation import Relocaliser
+from meslam_core.mapping.covisibility import CovisibilityLinker
+from meslam_core.mapping.keyframes import Rays
+from meslam_core.regions.atlas import RegionAtlas
+from meslam_core.scratch import ScratchFile
+from meslam_core.se3 import Pose, inverse
+
+# A new keyframe: its number, its images and its sample of rays, camera frame.
+NewKeyframe = tuple[int, RgbdFrame, Rays]
+# While frames wait, no more than one registration is made a frame, and this many keyframes may be
+# behind with theirs; then the oldest goes without.
+KEYFRAMES_BEHIND = 8
+
+
+class KeyframeRegistration:
+    """Registers new keyframes with older ones, as far as frames leave time for it.
+
+    Args:
+        config: what is registered.
+        atlas: its doubtful regions are asked whether they know the view.
+        scratch: where the keyframes' images lie.
+        frames_wait: whether frames wait to be tracked. While they do, registrations are spread
+            over the frames to come.
+
+    Attributes:
+        recogniser: asks regions that woke, where loops are closed.
+        relocaliser: finds a lost camera, while no training runs.
+    """
+
+    def __init__(
+        self,
+        config: MeslamConfig,
+        atlas: RegionAtlas,
+        scratch: ScratchFile,
+        frames_wait: Callable[[], bool],
+    ) -> None:
+        self._atlas = atlas
+        self._keyframes = atlas.keyframes
+        self._frames_wait = frames_wait
+        self._behind: deque[Iterator[None]] = deque(maxlen=KEYFRAMES_BEHIND)
+        self._linker: CovisibilityLinker | None = None
+        self.recogniser: RegionRecogniser | None = None
+        if config.keyframes.links:
+            self._linker = CovisibilityLinker(self._keyframes, config, scratch)
+            if config.regions.close_loops:
+                self.recogniser = RegionRecogniser(atlas, self._linker)
+        self.relocaliser = Relocaliser(config.relocalisation, config.tracking, atlas, self._linker)
+
+    def add(self, keyframe: NewKeyframe) -> None:
+        """Take a new keyframe, to be registered when `proceed` comes to it."""
+        if self._linker is None:
+            return
+        number, frame, rays = keyframe
+        self._linker.keep(number, frame)
+        self.relocaliser.remember(number)
+        self._behind.append(self._registrations(self._linker, number, frame.camera, rays))
+
+    def proceed(self) -> Pose:
+        """Make the registrations that are due.
+
+        Returns:
+            (4, 4) how that moved the newest keyframe, map frame: the identity, unless a place was
+            recognised and the path to here corrected.
+        """
+        corrections = self._corrections
+        newest = len(self._keyframes) - 1
+        before = self._keyframes.pose(newest)
+        done = 0
+        while self._behind and not (done and self._frames_wait()):
+            if next(self._behind[0], self) is self:
+                self._behind.popleft()
+            else:
+                done += 1
+        if self._corrections == corrections:
+            return np.eye(4)
+        return self._keyframes.pose(newest) @ inverse(before)
+
+    @property
+    def _corrections(self) -> int:
+        return self.recogniser.corrections if self.recogniser else 0
+
+    def _registrations(
+        self, linker: CovisibilityLinker, number: int, camera: PinholeCamera, rays: Rays
+    ) -> Iterator[None]:
+        """One registration after the other."""
+        for link in linker.link(number, camera, rays):
+            if link is not None:
+                self._keyframes.add_link(link.first, link.second, link.T_first_second)
+            yield
+        if self.recogniser is not None:
+            for region in self._atlas.doubtful[:1]:
+                yield from self.recogniser.ask(region, number, camera, rays)

@@ -30,6 +30,8 @@ _meslam_env() {
     done
     # The wheels would start every Python twice to set the library path that is set above.
     export _ROS_WHEELS_BOOTSTRAP_COMPLETE=1
+    # There is no `ros2 run`: the nodes are commands of their own.
+    _meslam_prepend PATH "$root/install/meslam_ros/lib/meslam_ros"
   fi
 
   # shellcheck disable=SC1091

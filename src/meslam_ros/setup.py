@@ -15,6 +15,7 @@ NODES = (
     "bag_player_node",
     "camera_node",
 )
+TOOLS = ("call_service",)
 # colcon runs a symlink of this file in its build folder: the folders beside the real file count.
 PACKAGE_DIR = Path(__file__).resolve().parent
 CONFIG_DIRS = (PACKAGE_DIR / "config", PACKAGE_DIR.parents[1] / "config")
@@ -44,5 +45,5 @@ setup(
         (f"share/{NAME}/config", files_in(*CONFIG_DIRS)),
     ],
     zip_safe=False,
-    entry_points={"console_scripts": [f"{node} = {NAME}.{node}:main" for node in NODES]},
+    entry_points={"console_scripts": [f"{node} = {NAME}.{node}:main" for node in (*NODES, *TOOLS)]},
 )

@@ -27,6 +27,7 @@ NODES = (
     "slam_node",
     "bag_player_node",
     "camera_node",
+    "call_service",
 )
 # From the metadata that ROS 2 Jazzy's own rosbag2 writes.
 JAZZY_TF_MESSAGE_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"

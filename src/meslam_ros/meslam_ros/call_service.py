@@ -48,19 +48,26 @@ def fill(message: Any, values: Any) -> Any:
             raise CallError(f"there is no field {name}; there are {', '.join(kinds)}")
         try:
             setattr(message, name, _value(kinds[name], value))
-        except (AssertionError, TypeError, ValueError) as error:
+        except (TypeError, ValueError) as error:
             raise CallError(f"{name} is {kinds[name]}, which {value!r} does not fit") from error
     return message
 
 
 def _value(kind: str, value: Any) -> Any:
+    """A value of a field; rclpy itself does not look at what it is given."""
     element = re.match(r"sequence<([^,>]+)|([\w/]+)\[", kind)
     if element is not None:
+        if not isinstance(value, list):
+            raise ValueError
         return [_value(element[1] or element[2], entry) for entry in value]
     if "/" in kind:
         return fill(interface(kind)(), value)
     if kind in ("float", "double"):
         return float(value)
+    if kind.startswith("string"):
+        return str(value)
+    if type(value) is not (bool if kind == "boolean" else int):
+        raise ValueError
     return value
 
 

@@ -34,10 +34,15 @@ class Server:
     """A map server's map and its keeper, without a node."""
 
     def __init__(self, folder: Path, **settings) -> None:
+        self.said: list[str] = []
         self.warnings: list[str] = []
         self.models = MapModels(MeslamConfig(), "map")
         self.keeper = MapKeeper(
-            self.models, folder, MapServerSettings(**settings), self.warnings.append
+            self.models,
+            folder,
+            MapServerSettings(**settings),
+            self.said.append,
+            self.warnings.append,
         )
 
 
@@ -83,6 +88,7 @@ def test_the_last_state_is_kept_when_another_map_begins(tmp_path, region) -> Non
     server.models.load(tmp_path / "other.meslam")
     assert versions(tmp_path / SECOND) == {(0, 0, 0): 1}
     assert server.warnings == []
+    assert [map_id in said for map_id, said in zip((FIRST, SECOND), server.said, strict=True)]
 
 
 def test_a_map_is_kept_in_the_background_and_at_the_end(tmp_path, region) -> None:

@@ -36,7 +36,7 @@ class MapKeeper:
         models: the map.
         folder: for the maps.
         settings: how many, and how often.
-        warn: takes messages for people.
+        inform, warn: take messages for people.
     """
 
     def __init__(
@@ -44,11 +44,13 @@ class MapKeeper:
         models: MapModels,
         folder: Path,
         settings: MapServerSettings,
+        inform: Callable[[str], object],
         warn: Callable[[str], object],
     ) -> None:
         self._models = models
         self._folder = folder
         self._settings = settings
+        self._inform = inform
         self._warn = warn
         self._kept: tuple[str, dict[RegionIndex, int]] = ("", {})
         self._store: MapStore | None = None
@@ -56,7 +58,7 @@ class MapKeeper:
         self._writing = threading.Lock()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        models.before_replacing = self.keep
+        models.before_replacing = self._keep_replaced
 
     def restore(self) -> str:
         """Serve the newest map that can be read; its folder, or empty where there is none."""
@@ -103,6 +105,13 @@ class MapKeeper:
                 return
             self._kept = versions
             self._pause_s = (time.monotonic() - started) / WRITE_SHARE
+
+    def _keep_replaced(self) -> None:
+        self.keep()
+        map_id, _ = self._kept
+        if map_id and map_id == self._models.map_id:
+            path = self._folder / _folder_name(map_id)
+            self._inform(f"another map takes the place of {map_id}, which is kept in {path}")
 
     def _run(self) -> None:
         written_s = time.monotonic()

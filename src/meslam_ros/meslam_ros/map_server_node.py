@@ -52,11 +52,12 @@ class MapServerNode(ManagedNode):
         self._config = read_config(self)
         limit_threads(self._config.runtime.threads, load_open3d=False)
         self._models = MapModels(self._config, self._frames.map_frame)
+        log = self.get_logger()
         self._keeper = MapKeeper(
-            self._models, self._kept_folder, self._settings, self.get_logger().warn
+            self._models, self._kept_folder, self._settings, log.info, log.warn
         )
         if self._settings.restore and (restored := self._keeper.restore()):
-            self.get_logger().info(f"serving the map kept in {restored} until another one comes")
+            log.info(f"serving the map kept in {restored} until another one comes")
         self._refused: Counter[str] = Counter()
         self._transforms = TransformBuffer(self)
         requests = MapRequests(

@@ -90,9 +90,13 @@ class OdometryBuffer:
 
     Args:
         max_gap_ns: nothing is interpolated between messages that are farther apart [ns].
+
+    Attributes:
+        received: number of messages so far.
     """
 
     def __init__(self, max_gap_ns: int = MAX_GAP_NS) -> None:
+        self.received = 0
         self._max_gap_ns = max_gap_ns
         self._stamps: list[int] = []
         self._messages: dict[int, Odometry] = {}
@@ -110,6 +114,7 @@ class OdometryBuffer:
         """
         stamp = stamp_ns(message.header.stamp)
         with self._changed:
+            self.received += 1
             began = number < self._number
             if began:
                 self._began_ns = stamp

@@ -57,6 +57,7 @@ class OdometrySource:
         gap_ns = round(config.given_gap_s * NANOSECONDS) if topic else MAX_GAP_NS
         self._buffer = OdometryBuffer(gap_ns)
         self._last_ns: int | None = None
+        self._received_in_vain: int | None = None
         self._subscription = node.create_subscription(
             Odometry, topic or topics.ODOMETRY, self._take, GIVEN if topic else STREAM
         )
@@ -98,8 +99,11 @@ class OdometrySource:
                 throttle_duration_sec=10 * WARNING_PERIOD_S,
             )
             return None
-        messages = self._buffer.wait(frame.stamp_ns, self._timeout_s())
+        # One that was killed stays known for a while: only the first image waits for it in vain.
+        silent = self._buffer.received == self._received_in_vain
+        messages = self._buffer.wait(frame.stamp_ns, 0.0 if silent else self._timeout_s())
         if not messages:
+            self._received_in_vain = self._buffer.received
             log.warn(
                 f"no odometry came for the image at {frame.stamp_s:.3f} s: tracked without",
                 throttle_duration_sec=WARNING_PERIOD_S,

@@ -121,6 +121,13 @@ def byte_array(data: Any) -> array.array:
     return result
 
 
+def numbers(code: str, values: NDArray[Any]) -> array.array:
+    """Numbers of a type code of `array` as the type that rclpy takes without looking at each."""
+    result = array.array(code)
+    result.frombytes(np.ascontiguousarray(values, np.dtype(code)).tobytes())
+    return result
+
+
 def to_pose(T: se3.Pose) -> Pose:
     """A pose message of a (4, 4) pose [m]."""
     return Pose(position=_point(T), orientation=_quaternion(T))

@@ -11,12 +11,14 @@ import numpy as np
 
 from meslam_core.config import MeslamConfig
 from meslam_core.map.neural_map import NeuralMap
+from meslam_core.map.reader import LoadedMap
 from meslam_core.map.store import MapStore
 from meslam_core.map.stored_region import StoredRegion
+from meslam_core.map.surface import MapSurfaces
 from meslam_core.regions.grid import RegionGrid, RegionIndex
 from meslam_interfaces.msg import RegionArray, RegionModel
 from meslam_ros.region_catalog import RegionCatalog, RegionEntry
-from meslam_ros.region_messages import region_model, stored_region
+from meslam_ros.region_messages import encoded_model, stored_region
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,14 @@ class MapSnapshot:
         stamp_ns: of the newest image in it [ns].
         versions: of its regions.
         map: that answers.
+        surfaces: its surfaces and the distances to them.
     """
 
     map_id: str
     stamp_ns: int
     versions: dict[RegionIndex, int]
     map: NeuralMap
+    surfaces: MapSurfaces
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,7 @@ class MapModels:
         self._live_map_id = ""
         self._replaced_map_id = ""
         self._snapshot: MapSnapshot | None = None
+        self._surfaces: MapSurfaces | None = None
         self._lock = threading.RLock()
 
     def add(self, model: RegionModel) -> bool:
@@ -125,11 +130,16 @@ class MapModels:
         with self._lock:
             if self._snapshot is None:
                 regions = dict(self._regions)
+                neural_map = NeuralMap(
+                    regions.values(), self._config.map, self._config.field.backend
+                )
+                self._surfaces = MapSurfaces(neural_map, known=self._surfaces)
                 self._snapshot = MapSnapshot(
                     map_id=self._catalog.map_id,
                     stamp_ns=self._catalog.newest_stamp_ns,
                     versions={index: region.version for index, region in regions.items()},
-                    map=NeuralMap(regions.values(), self._config.map, self._config.field.backend),
+                    map=neural_map,
+                    surfaces=self._surfaces,
                 )
             return self._snapshot
 
@@ -169,20 +179,28 @@ class MapModels:
                 grid=self._grid() if self._regions else None,
             )
 
-    def load(self, path: Path) -> list[str]:
+    def load(
+        self,
+        path: Path,
+        confirm: Callable[[LoadedMap, list[RegionModel]], None] = lambda loaded, models: None,
+    ) -> list[str]:
         """Replace the map by a stored one; returns one sentence for every damaged region.
+
+        Args:
+            path: of the stored map's folder.
+            confirm: called with what was read and the regions' models, exactly as they are
+                stored; what it raises leaves the map as it is.
 
         Raises:
             MapError: when the folder is no map or nothing of it can be read.
         """
         loaded = MapStore(path).load()
-        precision = self._config.map.codec
         models = [
-            region_model(region, loaded.map_id, self._map_frame, precision)
+            encoded_model(region, loaded.encoded[region.index], loaded.map_id, self._map_frame)
             for region in loaded.regions
         ]
+        confirm(loaded, models)
         self.before_replacing()
-        # Networks that were stored with this precision encode to the very same bytes again.
         with self._lock:
             self._begin(loaded.map_id)
             self._lattice = loaded.grid
@@ -198,7 +216,7 @@ class MapModels:
         self._lattice = None
         self._regions.clear()
         self._data.clear()
-        self._snapshot = None
+        self._snapshot = self._surfaces = None
 
     def _grid(self) -> RegionGrid:
         """A loaded map's lattice, else the one that the first region and the overlap tell."""

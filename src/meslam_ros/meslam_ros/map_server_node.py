@@ -23,20 +23,26 @@ from meslam_interfaces.srv import (
     SaveMap,
 )
 from meslam_ros import topics
+from meslam_ros.answers import answering
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, WARN, Diagnostics, counts
+from meslam_ros.export_action import ExportActionServer
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.map_keeper import RECENT, MapKeeper
 from meslam_ros.map_models import MapModels
 from meslam_ros.map_requests import MapRequests
 from meslam_ros.map_topics import MapTopics
+from meslam_ros.mesh_requests import MeshRequests
 from meslam_ros.node_settings import MapFrameSettings, MapServerSettings
 from meslam_ros.parameters import declare_config, declare_settings, read_config
 from meslam_ros.qos import MODELS_DEPTH, latched
 from meslam_ros.region_messages import model_name
 from meslam_ros.rgbd_input import STEADY
+from meslam_ros.served_map import ServedMap
+from meslam_ros.store_requests import StoreRequests
+from meslam_ros.tracking_client import TrackingClient
 from meslam_ros.transform_buffer import TransformBuffer
 
-EXECUTOR_THREADS = 4
+EXECUTOR_THREADS = 8
 
 
 class MapServerNode(ManagedNode):
@@ -60,27 +66,28 @@ class MapServerNode(ManagedNode):
             log.info(f"serving the map kept in {restored} until another one comes")
         self._refused: Counter[str] = Counter()
         self._transforms = TransformBuffer(self)
-        requests = MapRequests(
-            self._models,
-            self._settings,
-            self._config.regions.overlap,
-            self._frames.map_frame,
-            self._lookup,
-            self.get_logger().error,
+        served = ServedMap(self._models, self._settings, self._frames.map_frame)
+        self._tracking = TrackingClient(self)
+        requests = MapRequests(served, self._config.regions.overlap, self._lookup)
+        meshes, stores = MeshRequests(served), StoreRequests(served, self._tracking.use_map)
+        # Of what takes long one runs at a time, so that threads are left for the rest.
+        quick, mesh, grid, store, export = (
+            ReentrantCallbackGroup(),
+            *(MutuallyExclusiveCallbackGroup() for _ in range(4)),
         )
-        group = ReentrantCallbackGroup()
         self._map_services = [
-            self.create_service(kind, name, requests.answer(handler), callback_group=group)
-            for kind, name, handler in (
-                (ExportMap, topics.EXPORT_MAP, requests.export_map),
-                (GetMesh, topics.GET_MESH, requests.get_mesh),
-                (QueryOccupancy, topics.QUERY_OCCUPANCY, requests.query_occupancy),
-                (GetOccupancyGrid, topics.GET_OCCUPANCY_GRID, requests.get_occupancy_grid),
-                (SaveMap, topics.SAVE_MAP, requests.save_map),
-                (LoadMap, topics.LOAD_MAP, requests.load_map),
-                (ListRegions, topics.LIST_REGIONS, requests.list_regions),
+            self.create_service(kind, name, answering(handler, log.error), callback_group=group)
+            for kind, name, handler, group in (
+                (ExportMap, topics.EXPORT_MAP, meshes.export_map, export),
+                (GetMesh, topics.GET_MESH, meshes.get_mesh, mesh),
+                (QueryOccupancy, topics.QUERY_OCCUPANCY, requests.query_occupancy, quick),
+                (GetOccupancyGrid, topics.GET_OCCUPANCY_GRID, requests.get_occupancy_grid, grid),
+                (SaveMap, topics.SAVE_MAP, stores.save_map, store),
+                (LoadMap, topics.LOAD_MAP, stores.load_map, store),
+                (ListRegions, topics.LIST_REGIONS, requests.list_regions, quick),
             )
         ]
+        self._export = ExportActionServer(self, meshes, log.error)
         self._diagnostics = Diagnostics(self)
 
     @property
@@ -110,6 +117,8 @@ class MapServerNode(ManagedNode):
     def cleanup(self) -> None:
         self._diagnostics.close()
         self._transforms.close()
+        self._export.close()
+        self._tracking.close()
         for service in self._map_services:
             self.destroy_service(service)
 

@@ -22,7 +22,11 @@ def region_model(region: StoredRegion, map_id: str, map_frame: str, precision: s
     Raises:
         MapError: when the region holds values that the format cannot.
     """
-    data = encode(region, precision)
+    return encoded_model(region, encode(region, precision), map_id, map_frame)
+
+
+def encoded_model(region: StoredRegion, data: bytes, map_id: str, map_frame: str) -> RegionModel:
+    """The message of a region that is encoded already."""
     message = RegionModel(
         map_id=map_id,
         index=np.array(region.index, np.int32),

@@ -37,6 +37,11 @@ class PlacedRegion:
         """Whether anything observed may lie in a box of the map frame."""
         return bool((self.bounds[0] <= high).all() and (self.bounds[1] >= low).all())
 
+    def in_box(self, points: Points) -> NDArray[np.bool_]:
+        """Which points (N, 3) of the map frame lie in the region's box."""
+        local = np.abs(self.to_local(points))
+        return np.asarray(local.max(axis=1, initial=0.0) <= self.stored.half_side_m, np.bool_)
+
     def observed_centers(self, near_surface: bool = False) -> NDArray[np.float64]:
         """Centres (N, 3) of the voxels observed, or of those near a surface, map frame [m]."""
         mask = self.stored.mask

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,15 @@ from scipy.spatial import cKDTree
 
 from meslam_core.errors import MapError
 from meslam_core.map.neural_map import NeuralMap
+from meslam_core.map.placed_region import PlacedRegion
 
 DEFAULT_SPACING_M = 0.04
 NEWTON_STEPS = 2
+# Distances in the field grow at most so fast: what is farther from a surface is not tried.
+MAX_SLOPE = 1.5
+
+Floats = NDArray[np.float32]
+Key = tuple[tuple[int, int, int], int, bytes, float]
 
 
 @dataclass(frozen=True)
@@ -25,8 +32,8 @@ class SurfacePoints:
         colors: (N, 3) uint8 RGB.
     """
 
-    positions: NDArray[np.float32]
-    normals: NDArray[np.float32]
+    positions: Floats
+    normals: Floats
     colors: NDArray[np.uint8]
 
 
@@ -36,27 +43,143 @@ def surface_points(neural_map: NeuralMap, spacing_m: float = DEFAULT_SPACING_M) 
     Raises:
         MapError: when the spacing makes no sense.
     """
-    if not 0.005 <= spacing_m <= 1.0:
-        raise MapError(f"a point spacing of {spacing_m} m is outside 0.005 to 1 m")
+    return MapSurfaces(neural_map).points(spacing_m)
+
+
+class MapSurfaces:
+    """Surfaces of a map and distances to them, also far off, where the field itself saturates.
+
+    Points are found region by region when they are first needed. Usable from any thread.
+
+    Args:
+        neural_map: to ask.
+        known: of the map as it was before; what it found of regions that have not changed since
+            is taken over.
+    """
+
+    def __init__(self, neural_map: NeuralMap, known: MapSurfaces | None = None) -> None:
+        self._map = neural_map
+        self._lock = threading.Lock()
+        self._found: dict[Key, Floats] = {}
+        self._tree: tuple[list[Key], cKDTree] | None = None
+        if known is not None:
+            versions = {_version(region) for region in neural_map.regions}
+            with known._lock:
+                self._found = {k: v for k, v in known._found.items() if k[:3] in versions}
+                self._tree = known._tree
+
+    def points(self, spacing_m: float = DEFAULT_SPACING_M) -> SurfacePoints:
+        """Points on every surface that was seen.
+
+        Raises:
+            MapError: when the spacing makes no sense.
+        """
+        if not 0.005 <= spacing_m <= 1.0:
+            raise MapError(f"a point spacing of {spacing_m} m is outside 0.005 to 1 m")
+        with self._lock:
+            found = [self._of(region, spacing_m) for region in self._map.regions]
+        points = np.concatenate([np.zeros((0, 9), np.float32), *found])
+        points = points[_one_a_cube(points, spacing_m)]
+        colors = np.round(points[:, 6:] * 255.0).astype(np.uint8)
+        return SurfacePoints(points[:, :3], points[:, 3:6], colors)
+
+    def distance_m(self, points: NDArray[np.floating], farthest_m: float = np.inf) -> Floats:
+        """Distance (N,) of points (N, 3) to the nearest surface that was seen [m].
+
+        Never negative, never more than `farthest_m`; infinite where the map has no surface. Within
+        half the truncation distance it is the field's, elsewhere that to the nearest surface point.
+        """
+        values = self._map.values(points, near_only=True)
+        near = np.abs(self._map.to_meters(values.distance))
+        result = np.full(len(near), np.float32(farthest_m))
+        far = np.flatnonzero(~(near < 0.5 * self._map.truncation_m))
+        if len(far):
+            result[far] = self._searched(np.asarray(points, np.float64)[far], farthest_m)
+        return np.where(near < 0.5 * self._map.truncation_m, near, result).astype(np.float32)
+
+    def signed_distance_m(self, points: NDArray[np.floating], farthest_m: float = 0.0) -> Floats:
+        """Distance (N,), positive in free space and negative behind a surface; NaN where unknown.
+
+        Args:
+            points: (N, 3).
+            farthest_m: distances are clipped at plus and minus this [m]; 0 takes the truncation
+                distance, within which the field answers alone.
+        """
+        # The field's distance grows behind the surface, the answer's in free space.
+        ahead = -self._map.signed_distance_m(points)
+        limit = np.float32(farthest_m or self._map.truncation_m)
+        if limit > self._map.truncation_m:
+            known = np.flatnonzero(np.isfinite(ahead))
+            distance = self.distance_m(np.asarray(points)[known], float(limit))
+            ahead[known] = np.copysign(distance, ahead[known])
+        return ahead.clip(-limit, limit)
+
+    def _searched(self, points: NDArray[np.float64], farthest_m: float) -> Floats:
+        """Distance (N,) to the nearest surface point, at most `farthest_m`."""
+        low, high = points.min(axis=0) - farthest_m, points.max(axis=0) + farthest_m
+        with self._lock:
+            regions = self._map.touching(low, high)
+            found = [self._of(region, DEFAULT_SPACING_M) for region in regions]
+            keys = [_key(region, DEFAULT_SPACING_M) for region in regions]
+            if not sum(map(len, found)):
+                return np.full(len(points), np.float32(farthest_m))
+            if self._tree is None or self._tree[0] != keys:
+                self._tree = keys, cKDTree(np.concatenate(found)[:, :3])
+            tree = self._tree[1]
+        distances = tree.query(points, workers=1, distance_upper_bound=farthest_m)[0]
+        return np.minimum(distances, farthest_m).astype(np.float32)
+
+    def _of(self, region: PlacedRegion, spacing_m: float) -> Floats:
+        """Position, normal and colour (M, 9) of a region's surface points."""
+        key = _key(region, spacing_m)
+        if key not in self._found:
+            self._found[key] = _region_points(self._map, region, spacing_m)
+        return self._found[key]
+
+
+def _version(region: PlacedRegion) -> tuple[tuple[int, int, int], int, bytes]:
+    stored = region.stored
+    return stored.index, stored.version, stored.T_map_region.tobytes()
+
+
+def _key(region: PlacedRegion, spacing_m: float) -> Key:
+    return *_version(region), spacing_m
+
+
+def _region_points(neural_map: NeuralMap, region: PlacedRegion, spacing_m: float) -> Floats:
+    """Points (M, 9) on the surfaces in a region's box, and in what it saw outside all boxes."""
+    centers = region.observed_centers(near_surface=True)
+    elsewhere = np.zeros(len(centers), bool)
+    for other in neural_map.regions:
+        elsewhere |= other.in_box(centers)
+    centers = centers[region.in_box(centers) | ~elsewhere]
+    voxel_m = region.stored.mask.voxel_m
+    centers = centers[_near(neural_map, centers, voxel_m)]
+    count = max(1, round(voxel_m / spacing_m))
+    offsets = ((np.arange(count) + 0.5) / count - 0.5) * voxel_m
     found = [np.zeros((0, 9), np.float32)]
-    for region in neural_map.regions:
-        centers = region.observed_centers(near_surface=True)
-        voxel_m = region.stored.mask.voxel_m
-        count = max(1, round(voxel_m / spacing_m))
-        offsets = ((np.arange(count) + 0.5) / count - 0.5) * voxel_m
-        for offset in np.stack(np.meshgrid(offsets, offsets, offsets), axis=-1).reshape(-1, 3):
-            found.append(_on_surface(neural_map, centers + offset, 0.9 * voxel_m / count))
-    points = np.concatenate(found)
-    cubes = np.floor(points[:, :3] / spacing_m).astype(np.int32)
-    _, kept = np.unique(cubes, axis=0, return_index=True)
-    points = points[kept]
-    colors = np.round(points[:, 6:] * 255.0).astype(np.uint8)
-    return SurfacePoints(points[:, :3], points[:, 3:6], colors)
+    for offset in np.stack(np.meshgrid(offsets, offsets, offsets), axis=-1).reshape(-1, 3):
+        points = centers + offset @ region.rotation.T
+        points = points[_near(neural_map, points, voxel_m / count)]
+        found.append(_on_surface(neural_map, points, 0.9 * voxel_m / count))
+    rows: Floats = np.concatenate(found).astype(np.float32, copy=False)
+    return rows[_one_a_cube(rows, spacing_m)]
 
 
-def _on_surface(
-    neural_map: NeuralMap, points: NDArray[np.floating], reach_m: float
-) -> NDArray[np.float32]:
+def _near(neural_map: NeuralMap, centers: NDArray[np.float64], side_m: float) -> NDArray[np.bool_]:
+    """Which cubes may hold a surface, by the field at their centres (N, 3)."""
+    distance = np.abs(neural_map.to_meters(neural_map.values(centers).distance))
+    return np.asarray(distance <= 0.5 * np.sqrt(3.0) * MAX_SLOPE * side_m, np.bool_)
+
+
+def _one_a_cube(points: Floats, spacing_m: float) -> NDArray[np.intp]:
+    """Numbers of points (N, 9), one for each cube of the spacing that holds any."""
+    cubes = np.floor(points[:, :3] / spacing_m).astype(np.int64) + (1 << 20)
+    numbers = (cubes[:, 0] << 42) | (cubes[:, 1] << 21) | cubes[:, 2]
+    return np.unique(numbers, return_index=True)[1]
+
+
+def _on_surface(neural_map: NeuralMap, points: NDArray[np.floating], reach_m: float) -> Floats:
     """Position, normal and colour (M, 9) of those points (N, 3) that have a surface in reach."""
     start = points
     for step in range(NEWTON_STEPS + 1):
@@ -70,28 +193,3 @@ def _on_surface(
         if step < NEWTON_STEPS:
             points = points - ahead_m[:, None] * normals
     return np.concatenate([points, normals, values.color[good]], axis=1).astype(np.float32)
-
-
-class SurfaceIndex:
-    """Distances to the nearest surface, also far from it, where the field itself saturates.
-
-    Args:
-        neural_map: to ask.
-        spacing_m: of the surface points searched [m].
-    """
-
-    def __init__(self, neural_map: NeuralMap, spacing_m: float = DEFAULT_SPACING_M) -> None:
-        self.points = surface_points(neural_map, spacing_m)
-        self._map = neural_map
-        self._tree = cKDTree(self.points.positions)
-
-    def distance_m(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Distance (N,) of points (N, 3) to the nearest surface that was seen [m].
-
-        Never negative; infinite where the map has no surface. Within half the truncation
-        distance it is the field's, elsewhere that to the nearest surface point.
-        """
-        searched = np.asarray(self._tree.query(points, workers=1)[0], np.float32)
-        values = self._map.values(points, near_only=True)
-        near = np.abs(self._map.to_meters(values.distance))
-        return np.where(near < 0.5 * self._map.truncation_m, near, searched)

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import subprocess
 import sys
 from contextlib import closing
@@ -38,6 +37,7 @@ from large_scene_run import FRAMES
 from machine import machine, machine_line
 from numpy.typing import NDArray
 from rich.console import Console
+from simulated import simulated
 
 from meslam_core.config import MeslamConfig
 from meslam_core.evaluation.reconstruction import observed_surface
@@ -253,16 +253,11 @@ def write(
     plot(summary, paths, names, stem.with_suffix(".png"))
 
 
-def simulated(options: argparse.Namespace) -> Path:
+def chosen_recording(options: argparse.Namespace) -> Path:
     """The recording, made where it is not there yet."""
     if options.recording is not None:
         return Path(options.recording).resolve()
-    target = CACHE / "building.mcap"
-    if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        program = shutil.which("meslam", path=Path(sys.executable).parent) or "meslam"
-        subprocess.run([program, "simulate", "building", "--out", str(target)], check=True)
-    return target
+    return simulated("building", CACHE / "building.mcap")
 
 
 def frames_of(method: str, options: argparse.Namespace) -> str:
@@ -307,7 +302,7 @@ def _told(arguments: list[str]) -> list[str]:
 
 def main() -> None:
     options = parsed_options(sys.argv[1:])
-    recording = simulated(options)
+    recording = chosen_recording(options)
     jobs = [
         Job(method, frames_of(method, options), options.seed, recording)
         for method in options.methods

@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from scipy.spatial import cKDTree
+from simulated import program, simulated
 
 from meslam_core.config import MeslamConfig
 from meslam_core.evaluation.reconstruction import (
@@ -106,20 +107,6 @@ class Space:
         camera = source.camera
         source.close()
         return observed_surface(self.surface, camera, self.until(frames), farthest_m=MAX_DEPTH_M)
-
-
-def program() -> str:
-    return shutil.which("meslam", path=str(Path(sys.executable).parent)) or "meslam"
-
-
-def simulated(path: Path, seconds: float) -> Path:
-    """The recording, made if it is missing."""
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        duration = ["--duration", f"{seconds:g}", "--fps", str(FPS)]
-        command = [program(), "simulate", "library", *duration, "--out", str(path)]
-        subprocess.run(command, check=True)
-    return path
 
 
 def folder_of(space: Space, seconds: float) -> Path:
@@ -284,7 +271,10 @@ def parsed_options() -> argparse.Namespace:
 
 def main() -> None:
     options = parsed_options()
-    space = Space.read(simulated(options.recording, options.durations[-1]))
+    seconds = f"{options.durations[-1]:g}"
+    space = Space.read(
+        simulated("library", options.recording, "--duration", seconds, "--fps", str(FPS))
+    )
     rows = collect(space, options)
     options.out.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {

@@ -263,6 +263,15 @@ class RelocalisationConfig:
     candidates: int = setting(
         2, "keyframes that a lost frame is compared with", minimum=0, maximum=100
     )
+    min_fitness: float = setting(
+        0.5,
+        "share of a frame's points that must have a match in a keyframe's depth",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    min_image_likeness: float = setting(
+        0.8, "share of those that must look alike, too", minimum=0.0, maximum=1.0
+    )
     min_observed_ratio: float = setting(
         0.5, "share of a frame's points that must lie in mapped space", minimum=0.0, maximum=1.0
     )
@@ -284,6 +293,14 @@ class RelocalisationConfig:
     )
     agreement_deg: float = setting(
         3.0, "the same of the direction", unit="deg", minimum=0.1, maximum=90.0
+    )
+    new_map_after_s: float = setting(
+        0.0,
+        "a node that has looked for a lost camera in vain for so long begins a new map, which is "
+        "not connected with the old one (0: never)",
+        unit="s",
+        minimum=0.0,
+        maximum=86400.0,
     )
 
 

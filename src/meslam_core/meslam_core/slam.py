@@ -143,6 +143,12 @@ class Slam:
         return self.tracking.state
 
     @property
+    def wants_new_map(self) -> bool:
+        """Whether the camera is lost for so long that a new map is to begin, where configured."""
+        limit_s = self.config.relocalisation.new_map_after_s
+        return self._trains and 0.0 < limit_s <= self.tracking.searched_s
+
+    @property
     def recogniser(self) -> RegionRecogniser | None:
         """Asks regions that were come back to, where loops are closed."""
         return self._training.recogniser if self._training else None
@@ -236,7 +242,12 @@ class Slam:
             reference, relative = len(self.keyframes) - 1, np.eye(4)
         result = pending.result
         self._history.add(
-            result.stamp_ns, result.T_map_camera, reference, relative, result.odometry
+            result.stamp_ns,
+            result.T_map_camera,
+            reference,
+            relative,
+            result.odometry,
+            known=not self.tracking.lost,
         )
 
     def wait(self) -> None:
@@ -282,6 +293,10 @@ class Slam:
         """T_map_camera of every tracked frame as it is known now."""
         return self._history.trajectory()
 
+    def known_trajectory(self) -> Trajectory:
+        """`trajectory` without the frames of a lost camera, whose poses are guesses."""
+        return self._history.known_trajectory()
+
     def online_trajectory(self) -> Trajectory:
         """T_map_camera of every frame as it was known when the frame was done."""
         return self._history.online_trajectory()
@@ -292,11 +307,12 @@ class Slam:
         """Look for a lost camera in the whole map; None where it is as lost as it was."""
         assert self._training is not None
         assert self.atlas is not None
+        if rays is None:
+            self.tracking.go_blind()
+            return None
         # It looks into regions and keyframes, which belong to the training that runs.
         self._finish_training()
-        sighting = None
-        if rays is not None:
-            sighting = self._training.relocaliser.find(frame, rays, self.tracking.believed)
+        sighting = self._training.relocaliser.find(frame, rays, self.tracking.believed)
         tracked = self.tracking.recover(frame.stamp_ns, sighting, odometry)
         if sighting is not None and tracked is not None and tracked.trusted:
             self.atlas.enter(sighting.region)

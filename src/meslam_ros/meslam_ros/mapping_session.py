@@ -207,6 +207,11 @@ class MappingSession:
         return len(self._slam.keyframes) if self._slam else 0
 
     def trajectory(self) -> Trajectory:
-        """T_map_camera of all frames as it is known now."""
+        """T_map_camera of all frames as it is known now, but of those of a lost camera."""
         assert self._slam is not None
-        return self._slam.trajectory()
+        return self._slam.known_trajectory()
+
+    @property
+    def wants_new_map(self) -> bool:
+        """Whether the camera is lost for so long that a new map is to begin, where configured."""
+        return self._slam is not None and self._slam.wants_new_map

@@ -174,6 +174,8 @@ class TrackingNode(ManagedNode):
         self._all_published = False
         if time.monotonic() >= self._path_due_s and self._path.get_subscription_count():
             self._publish_path()
+        if session.wants_new_map:
+            self.restart("the camera has been lost for too long")
 
     def refuse(self, pair: ImagePair, reason: str) -> None:
         """Tell that a pair was not tracked, and why (`FrameConsumer`)."""

@@ -10,7 +10,7 @@ import torch
 
 from meslam_core.config import TrackingConfig
 from meslam_core.mapping.keyframes import Rays, rays_at
-from meslam_core.odometry import OdometryEstimate
+from meslam_core.odometry import MotionNoise, OdometryEstimate
 from meslam_core.se3 import Pose, exp
 from meslam_core.tracking.evidence import colour_likeness
 from meslam_core.tracking.field_tracker import FieldTracker, PosePrior
@@ -99,15 +99,29 @@ def test_where_odometry_failed_the_map_must_show_the_colours(mapped_room):
     assert checked.objection(here) == ""
 
 
-def test_valid_odometry_supports_nothing_until_the_map_confirms_a_pose_again(mapped_room):
+def test_odometry_that_began_anew_supports_nothing_until_the_map_confirms_a_pose(mapped_room):
     checked = Checked(mapped_room)
     plausibility = checked.plausibility
     plausibility.pass_by(odometry(valid=False))
     plausibility.pass_by(odometry(valid=True))
-    assert not plausibility.supported
+    # Its keyframe outlives a single failure.
+    assert plausibility.supported
+    for valid in (False, False, True):
+        plausibility.pass_by(odometry(valid))
+        assert not plausibility.supported
     plausibility.confirm(PERIOD_NS)
     plausibility.pass_by(odometry(valid=True))
     assert plausibility.supported
+
+
+def test_odometry_from_elsewhere_tells_the_motion_over_any_gap(mapped_room):
+    checked = Checked(mapped_room)
+    wheels = MotionNoise(distance_m=0.01, angle_rad=0.01, drift=0.0)
+    for valid in (False, False, False):
+        checked.plausibility.pass_by(replace(odometry(valid), noise=wheels))
+        assert not checked.plausibility.supported
+    checked.plausibility.pass_by(replace(odometry(valid=True), noise=wheels))
+    assert checked.plausibility.supported
 
 
 def test_where_there_never_was_odometry_its_silence_means_nothing(mapped_room):

@@ -97,8 +97,7 @@ class Disturbed:
         self._recording = recording
         self._truth = truth
         mapped = slam.trajectory()
-        estimate, reference = associate(mapped, truth)
-        self._T_truth_map = rigid_alignment(estimate.positions, reference.positions)
+        self._T_truth_map = _alignment(mapped, truth)
         self._stamp_ns = int(mapped.stamps_ns[-1])
         self._period_ns = int(np.median(np.diff(mapped.stamps_ns)))
         self._last = self._true_pose(self._stamp_ns)
@@ -122,7 +121,7 @@ class Disturbed:
         start, frames = self._last, list(self._recording.frames(trial.back, trial.back + 1))
         if trial.kind != KIDNAPPED:
             for _ in range(round(covered_s * self.per_second)):
-                states.append(self._process(_dark(frames[0])).state)
+                states.append(self._process(dark(frames[0])).state)
         began_ns = self._stamp_ns + self._period_ns
         jump = inverse(start) @ self._true_pose(frames[0].stamp_ns)
         wrong = 0
@@ -224,13 +223,26 @@ def mirrored(frame: RgbdFrame) -> RgbdFrame:
     )
 
 
+def dark(frame: RgbdFrame) -> RgbdFrame:
+    """What a covered camera sees at that instant: no light, no depth."""
+    return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
+
+
 def share_within(outcomes: Sequence[Outcome], seconds: float) -> float:
     """Share of trials after which the camera was found in so short a time."""
     return sum(each.within(seconds) for each in outcomes) / max(len(outcomes), 1)
 
 
-def _dark(frame: RgbdFrame) -> RgbdFrame:
-    return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
+def _alignment(mapped: Trajectory, truth: Trajectory) -> Pose:
+    """T_truth_map (4, 4) by positions and, where these span little, by directions."""
+    estimate, reference = associate(mapped, truth)
+    return rigid_alignment(_around(estimate), _around(reference))
+
+
+def _around(trajectory: Trajectory) -> NDArray[np.float64]:
+    """Points (4 N, 3) a metre along the axes of all cameras, and their centres [m]."""
+    ends = trajectory.positions[:, None] + np.swapaxes(trajectory.rotations, 1, 2)
+    return np.concatenate([trajectory.positions, ends.reshape(-1, 3)])
 
 
 def _distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:

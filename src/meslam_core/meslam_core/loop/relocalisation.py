@@ -8,7 +8,6 @@ the map has there. `tracking.recovery` asks for the same answer twice in a row b
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from meslam_core.frame import RgbdFrame
 from meslam_core.loop.place_recall import PlaceRecall
 from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.keyframes import Rays
+from meslam_core.odometry import Registration
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.se3 import Pose, inverse, rotation_angle
 from meslam_core.tracking.evidence import colour_likeness
@@ -66,35 +66,37 @@ class Relocaliser:
             image = self._linker.image_of(keyframe)
             self.places.add(keyframe, image, self._atlas.keyframes.poses())
 
-    def find(self, frame: RgbdFrame, rays: Rays, believed: Sequence[Pose]) -> Sighting | None:
+    def find(self, frame: RgbdFrame, rays: Rays, T_map_believed: Pose) -> Sighting | None:
         """Look for a frame in the map; None where it is not recognised for certain.
 
         Args:
             frame: its images.
             rays: its sample, camera frame.
-            believed: (4, 4) T_map_camera where the camera was last, or where odometry has it.
+            T_map_believed: (4, 4) where the camera was last, or where odometry has it since;
+                asked where no keyframe is remembered.
         """
-        for sighting in self._sightings(frame, rays, believed):
-            if sighting is not None:
-                self._tried.clear()
-                return sighting
+        if self._linker is None or not len(self.places):
+            return self._verified(rays, T_map_believed, BELIEVED_SIGMA, None)
+        image = self._linker.image(frame)
+        prepared = self._linker.prepare(image)
+        for keyframe in self.places.propose(image, self._config.candidates, self._tried):
+            found = self._linker.find(keyframe, prepared, np.eye(4))
+            if found is not None and self._looks_alike(found):
+                pose = self._atlas.keyframes.pose(keyframe) @ found.T_target_source
+                sighting = self._verified(rays, pose, REGISTERED_SIGMA, keyframe)
+                if sighting is not None:
+                    self._tried.clear()
+                    return sighting
+            self._tried.append(keyframe)
         return None
 
-    def _sightings(
-        self, frame: RgbdFrame, rays: Rays, believed: Sequence[Pose]
-    ) -> Iterator[Sighting | None]:
-        """One after the other, the most promising candidates first; None where one fails."""
-        if self._linker is not None:
-            image = self._linker.image(frame)
-            prepared = self._linker.prepare(image)
-            for keyframe in self.places.propose(image, self._config.candidates, self._tried):
-                found = self._linker.find(keyframe, prepared, np.eye(4))
-                if found is not None:
-                    pose = self._atlas.keyframes.pose(keyframe) @ found.T_target_source
-                    yield self._verified(rays, pose, REGISTERED_SIGMA, keyframe)
-                self._tried.append(keyframe)
-        for pose in believed:
-            yield self._verified(rays, pose, BELIEVED_SIGMA, None)
+    def _looks_alike(self, found: Registration) -> bool:
+        """Whether two images show the same thing, and not only one of the same shape."""
+        limits = self._config
+        return (
+            found.fitness >= limits.min_fitness
+            and found.agreement >= limits.min_image_likeness * found.fitness
+        )
 
     def _verified(
         self, rays: Rays, T_map_camera: Pose, sigma: tuple[float, float], keyframe: int | None

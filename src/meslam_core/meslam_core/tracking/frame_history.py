@@ -70,6 +70,7 @@ class FrameHistory:
         self._references = np.zeros(64, np.int64)
         self._relative = np.zeros((64, 4, 4))
         self._online = np.zeros((64, 4, 4))
+        self._known = np.zeros(64, np.bool_)
         self._measured: deque[_Measured] = deque(maxlen=MAX_ODOMETRY_GAP)
         # By keyframe: how the next one was tracked in it, and when.
         self._handovers: dict[int, tuple[Pose, int]] = {}
@@ -86,6 +87,7 @@ class FrameHistory:
         reference: int,
         T_keyframe_camera: Pose,
         odometry: OdometryEstimate | None,
+        known: bool = True,
     ) -> None:
         """Append a frame.
 
@@ -95,15 +97,17 @@ class FrameHistory:
             reference: number of its keyframe.
             T_keyframe_camera: (4, 4) in that keyframe.
             odometry: its estimate, where there is one.
+            known: whether it is known where the camera was; not while it is lost.
         """
         if self._count == len(self._stamps_ns):
-            for name in ("_stamps_ns", "_references", "_relative", "_online"):
+            for name in ("_stamps_ns", "_references", "_relative", "_online", "_known"):
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
         self._stamps_ns[self._count] = stamp_ns
         self._references[self._count] = reference
         self._relative[self._count] = T_keyframe_camera
         self._online[self._count] = T_map_camera
+        self._known[self._count] = known
         if odometry is not None and (odometry.valid or odometry.noise is None):
             self._measured.append(_Measured(self._count, odometry))
         self._count += 1
@@ -163,6 +167,10 @@ class FrameHistory:
             return None
         motion = inverse(last.odometry.T_odom_camera) @ odometry.T_odom_camera
         return self.pose(last.number), motion
+
+    def known_trajectory(self) -> Trajectory:
+        """`trajectory` without the frames of a lost camera."""
+        return self.trajectory().subset(np.flatnonzero(self._known[: self._count]))
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every frame as it is known now.

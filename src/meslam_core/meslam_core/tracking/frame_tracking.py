@@ -88,6 +88,7 @@ class FrameTracking:
         self._plausibility = Plausibility(config, self.history)
         self._recovery = Recovery(relocalisation or RelocalisationConfig())
         self._untrusted = 0
+        self._led_on = False
         self._covariance = np.eye(6) * FIRST_VARIANCE
 
     @property
@@ -96,9 +97,9 @@ class FrameTracking:
         return self.state in (TrackingState.LOST, TrackingState.RELOCALISING)
 
     @property
-    def believed(self) -> list[Pose]:
-        """Where a lost camera may be (4, 4): where it was last trusted, and moved from there on."""
-        return [self._plausibility.last_trusted, self.history.pose(-1)]
+    def believed(self) -> Pose:
+        """Where a lost camera was last trusted, or where odometry from elsewhere has it, (4, 4)."""
+        return self.history.pose(-1) if self._led_on else self._plausibility.last_trusted
 
     def start(self, T_map_camera: Pose) -> TrackedPose:
         """The first frame's pose is given."""
@@ -155,7 +156,7 @@ class FrameTracking:
         """
         if sighting is None:
             self.state = TrackingState.LOST
-            self._recovery.reset()
+            self._recovery.miss(stamp_ns)
             return None
         alignment = sighting.alignment
         if self._recovery.confirms(alignment.T_map_camera, odometry):
@@ -165,6 +166,16 @@ class FrameTracking:
         self.state = TrackingState.RELOCALISING
         reason = "recognised once; a second frame has to agree"
         return TrackedPose(alignment.T_map_camera, self._covariance, False, reason, alignment)
+
+    def go_blind(self) -> None:
+        """A lost camera sees nothing that it could be recognised by."""
+        self.state = TrackingState.LOST
+        self._recovery.reset()
+
+    @property
+    def searched_s(self) -> float:
+        """For how long a lost camera that sees something has been looked for in vain [s]."""
+        return self._recovery.searched_s
 
     def _confirmed(self, stamp_ns: int, alignment: Alignment) -> TrackedPose:
         """The field tells the pose."""
@@ -178,6 +189,8 @@ class FrameTracking:
         """Where odometry alone has a lost camera, or else where it was."""
         moved = self.history.moved(odometry)
         pose = self.history.pose(-1) if moved is None else orthonormalized(moved[0] @ moved[1])
+        # Odometry by registration does not see the way that the camera was carried in the dark.
+        self._led_on = odometry is not None and odometry.noise is not None
         reason = "lost: nothing in the map looks like this view"
         return TrackedPose(pose, np.eye(6) * UNTRUSTED_VARIANCE, False, reason, None)
 

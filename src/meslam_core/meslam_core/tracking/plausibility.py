@@ -17,6 +17,9 @@ from meslam_core.tracking.frame_history import FrameHistory
 MOTION_SLACK_M = 0.05
 MOTION_SLACK_RAD = 0.05
 NANOSECONDS = 1e-9
+# Registered odometry keeps its keyframe over a single failure; after so many in a row it begins
+# anew wherever the camera is then.
+BEGINS_ANEW = 2
 
 
 class Plausibility:
@@ -31,8 +34,8 @@ class Plausibility:
         history: of all frames.
 
     Attributes:
-        supported: whether valid odometry leads from the last pose that the map confirmed to the
-            latest frame.
+        supported: whether odometry leads from the last pose that the map confirmed to the latest
+            frame.
     """
 
     def __init__(self, config: TrackingConfig, history: FrameHistory) -> None:
@@ -40,6 +43,7 @@ class Plausibility:
         self._config = config
         self._history = history
         self._followed = True
+        self._failures = 0
         self._has_odometry = False
         self._trusted: tuple[int, int] | None = None
 
@@ -52,8 +56,12 @@ class Plausibility:
         """Note a frame's odometry."""
         valid = odometry is not None and odometry.valid
         self._has_odometry = self._has_odometry or valid
-        self._followed = self._followed and valid
-        self.supported = self._followed
+        self._failures = 0 if valid else self._failures + 1
+        # Any two poses from elsewhere tell the motion between them, whatever was in between.
+        registered = odometry is None or odometry.noise is None
+        if registered and self._failures >= BEGINS_ANEW:
+            self._followed = False
+        self.supported = valid and self._followed
 
     def confirm(self, stamp_ns: int) -> None:
         """The map confirms the frame that is going to be added to the history."""

@@ -10,6 +10,8 @@ from meslam_core.config import RelocalisationConfig
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.se3 import Pose, inverse, rotation_angle
 
+NANOSECONDS = 1e-9
+
 
 @dataclass(frozen=True)
 class _Recognised:
@@ -27,15 +29,28 @@ class Recovery:
 
     Args:
         config: how well the two must agree.
+
+    Attributes:
+        searched_s: for so long no frame of those that showed anything was recognised [s].
     """
 
     def __init__(self, config: RelocalisationConfig) -> None:
+        self.searched_s = 0.0
         self._config = config
         self._latest: _Recognised | None = None
+        self._since_ns: int | None = None
 
     def reset(self) -> None:
-        """A frame was not recognised."""
+        """Nothing is being looked for, or nothing can be seen."""
+        self._latest = self._since_ns = None
+        self.searched_s = 0.0
+
+    def miss(self, stamp_ns: int) -> None:
+        """A frame, of a stamp [ns], was not recognised."""
         self._latest = None
+        if self._since_ns is None:
+            self._since_ns = stamp_ns
+        self.searched_s = (stamp_ns - self._since_ns) * NANOSECONDS
 
     def confirms(self, T_map_camera: Pose, odometry: OdometryEstimate | None) -> bool:
         """Whether a frame was recognised where the one before was, moved by odometry.

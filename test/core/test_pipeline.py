@@ -15,6 +15,7 @@ from data.memory_recording import MemoryRecording
 from meslam_core.errors import EvaluationError, OutputError, RecordingError
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.pipeline import RunOptions, run
+from meslam_core.pose_covariance import read_covariances
 from meslam_core.slam import FrameResult
 from meslam_core.trajectory import Trajectory, read_tum, write_tum
 
@@ -44,8 +45,12 @@ def covered(frame):
 
 def test_everything_of_the_contract_is_written(finished_run, room_frames):
     names = {file.name for file in finished_run.out.iterdir()}
-    assert names == {"trajectory.txt", "trajectory_online.txt", "map.meslam", "report.json"}
+    texts = {"trajectory.txt", "trajectory_online.txt", "covariance_online.txt"}
+    assert names == texts | {"map.meslam", "report.json"}
     stamps = [frame.stamp_ns for frame in room_frames]
+    covariances = read_covariances(finished_run.out / "covariance_online.txt")
+    assert covariances.stamps_ns.tolist() == stamps
+    assert np.linalg.eigvalsh(covariances.matrices).min() > 0
     for name in ("trajectory.txt", "trajectory_online.txt"):
         assert read_tum(finished_run.out / name).stamps_ns.tolist() == stamps
 

@@ -12,13 +12,15 @@ from typing import Any, Protocol
 from meslam_core.config import MeslamConfig
 from meslam_core.continuation import Continuation
 from meslam_core.errors import EvaluationError, FrameError, RecordingError
+from meslam_core.evaluation.covariance import covariance_entries
 from meslam_core.evaluation.report import truth_entries
 from meslam_core.interruption import stop_request
 from meslam_core.odometry import GivenOdometry, make_odometry
 from meslam_core.odometry_worker import OdometryWorker
 from meslam_core.pacing import PacedFrames
+from meslam_core.pose_covariance import PoseCovariances, write_covariances
 from meslam_core.recordings.recording import Recording
-from meslam_core.results import MAP, ONLINE_TRAJECTORY, TRAJECTORY, ResultFolder
+from meslam_core.results import COVARIANCES, MAP, ONLINE_TRAJECTORY, TRAJECTORY, ResultFolder
 from meslam_core.run_report import Tally, map_entries, run_environment
 from meslam_core.session_map import write_map
 from meslam_core.slam import FrameResult, Slam, TrackingState
@@ -109,9 +111,10 @@ def run(
     """Track and map a recording, and write what came of it.
 
     Writes `trajectory.txt` (refined) and `trajectory_online.txt` (TUM format, T_map_camera, one
-    line a tracked frame), `map.meslam/` and `report.json` into `out_dir`. A recording that breaks
-    off, or a user who interrupts (SIGINT, SIGTERM), still leaves the results of the frames before;
-    after any other error nothing of this run is left.
+    line a tracked frame), `covariance_online.txt` (see `write_covariances`), `map.meslam/` and
+    `report.json` into `out_dir`. A recording that breaks off, or a user who interrupts (SIGINT,
+    SIGTERM), still leaves the results of the frames before; after any other error nothing of this
+    run is left.
 
     Args:
         recording: open; it is not closed.
@@ -139,6 +142,8 @@ def run(
         online = loop.tally.tracked(slam.online_trajectory())
         write_tum(results.incomplete(TRAJECTORY), refined)
         write_tum(results.incomplete(ONLINE_TRAJECTORY), online)
+        covariances = loop.tally.covariances()
+        write_covariances(results.incomplete(COVARIANCES), covariances)
         report = loop.report()
         map_id = options.continuation.map_id if options.continuation else None
         report["map_bytes"] = write_map(
@@ -146,7 +151,7 @@ def run(
         )
         not_evaluated = ""
         if truth is not None:
-            not_evaluated = _evaluate(refined, online, truth, options.hand_eye, report)
+            not_evaluated = _evaluate(refined, online, covariances, truth, options.hand_eye, report)
         report.update(run_environment())
         results.write_report(report)
         results.publish()
@@ -268,6 +273,7 @@ class _Loop:
 def _evaluate(
     refined: Trajectory,
     online: Trajectory,
+    covariances: PoseCovariances,
     truth: Trajectory,
     hand_eye: bool,
     report: dict[str, Any],
@@ -275,6 +281,7 @@ def _evaluate(
     """Add the errors against the truth to the report; why not, where they cannot be known."""
     try:
         report.update(truth_entries(refined, online, truth, hand_eye=hand_eye))
+        report.update(covariance_entries(online, covariances.matrices, truth, hand_eye=hand_eye))
     except EvaluationError as error:
         return str(error)
     return ""

@@ -15,6 +15,7 @@ from meslam_core.map.manifest import MANIFEST
 
 TRAJECTORY = "trajectory.txt"
 ONLINE_TRAJECTORY = "trajectory_online.txt"
+COVARIANCES = "covariance_online.txt"
 MAP = "map.meslam"
 REPORT = "report.json"
 
@@ -88,7 +89,7 @@ class ResultFolder:
             OutputError: when they cannot be moved to their places.
         """
         try:
-            for name in (TRAJECTORY, ONLINE_TRAJECTORY, MAP, REPORT):
+            for name in (TRAJECTORY, ONLINE_TRAJECTORY, COVARIANCES, MAP, REPORT):
                 target, result = self.path / name, self.incomplete(name)
                 if target.is_dir():
                     shutil.rmtree(target)

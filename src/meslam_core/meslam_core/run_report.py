@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 import meslam_core
+from meslam_core.pose_covariance import PoseCovariances
 from meslam_core.regions.observed_mask import OBSERVED, ObservedMask
 from meslam_core.slam import FrameResult, Slam, TrackingState
 from meslam_core.trajectory import Trajectory
@@ -28,6 +29,7 @@ class Tally:
     frames: int = 0
     degraded: int = 0
     tracked_stamps_ns: list[int] = field(default_factory=list)
+    tracked_covariances: list[NDArray[np.float64]] = field(default_factory=list)
     first_stamp_ns: int = 0
     last_stamp_ns: int = 0
     reading_ms: list[float] = field(default_factory=list)
@@ -45,6 +47,7 @@ class Tally:
         self.degraded += result.state is TrackingState.DEGRADED
         if is_tracked(result):
             self.tracked_stamps_ns.append(result.stamp_ns)
+            self.tracked_covariances.append(result.covariance)
         self.reading_ms.append(reading_ms)
         self.odometry_ms.append(odometry_ms)
         self.tracking_ms.append(result.tracking_ms)
@@ -68,6 +71,11 @@ class Tally:
                 "mapping": _spread(self.mapping_ms),
             },
         }
+
+    def covariances(self) -> PoseCovariances:
+        """Of the poses that were measured, as they were known live."""
+        stamps_ns = np.array(self.tracked_stamps_ns, np.int64)
+        return PoseCovariances(stamps_ns, np.array(self.tracked_covariances).reshape(-1, 6, 6))
 
     def tracked(self, trajectory: Trajectory) -> Trajectory:
         """The poses of a trajectory that were measured, not extrapolated."""

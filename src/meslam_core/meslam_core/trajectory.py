@@ -46,8 +46,8 @@ class Trajectory:
         if np.any(steps <= 0):
             index = int(np.argmax(steps <= 0)) + 1
             raise EvaluationError(
-                f"time stamp {_seconds(self.stamps_ns[index])} of pose {index} does not follow "
-                f"{_seconds(self.stamps_ns[index - 1])}; sort the poses and remove duplicates"
+                f"time stamp {stamp_text(self.stamps_ns[index])} of pose {index} does not follow "
+                f"{stamp_text(self.stamps_ns[index - 1])}; sort the poses and remove duplicates"
             )
         rotations = self.poses[:, :3, :3]
         deviation = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
@@ -55,9 +55,8 @@ class Trajectory:
         rigid &= np.isfinite(self.poses).all(axis=(1, 2))
         if not rigid.all():
             index = int(np.argmin(rigid))
-            raise EvaluationError(
-                f"pose {index} at {_seconds(self.stamps_ns[index])} s is not a finite rigid motion"
-            )
+            at = stamp_text(self.stamps_ns[index])
+            raise EvaluationError(f"pose {index} at {at} s is not a finite rigid motion")
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -140,7 +139,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         trajectory.stamps_ns, trajectory.positions, quaternions, strict=True
     ):
         numbers = " ".join(f"{value:.9f}" for value in (*position, *quaternion))
-        lines.append(f"{_seconds(stamp)} {numbers}\n")
+        lines.append(f"{stamp_text(stamp)} {numbers}\n")
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with partial.open("w", encoding="utf-8") as file:
@@ -157,11 +156,20 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         ) from error
 
 
-def _seconds(stamp_ns: int) -> str:
-    """Exact decimal seconds of a stamp; a float would lose nanoseconds of today's epoch."""
+def stamp_text(stamp_ns: int) -> str:
+    """Exact decimal seconds of a stamp [ns]; a float would lose nanoseconds of today's epoch."""
     sign = "-" if stamp_ns < 0 else ""
     whole, fraction = divmod(abs(int(stamp_ns)), NANOSECONDS)
     return f"{sign}{whole}.{fraction:09d}"
+
+
+def parsed_stamp(text: str) -> int:
+    """The stamp [ns] of decimal seconds, every digit of them.
+
+    Raises:
+        ValueError, OverflowError, decimal.InvalidOperation: when it is no finite number.
+    """
+    return int((Decimal(text) * NANOSECONDS).to_integral_value())
 
 
 def _parse(path: Path, number: int, content: list[str]) -> tuple[int, list[float]]:
@@ -170,7 +178,7 @@ def _parse(path: Path, number: int, content: list[str]) -> tuple[int, list[float
     if len(content) != 8:
         raise EvaluationError(f"{where}: {len(content)} values; expected `{TUM_COLUMNS}`")
     try:
-        stamp = int((Decimal(content[0]) * NANOSECONDS).to_integral_value())
+        stamp = parsed_stamp(content[0])
         row = [float(value) for value in content[1:]]
     except (InvalidOperation, ValueError, OverflowError) as error:
         raise EvaluationError(f"{where}: not a number; expected `{TUM_COLUMNS}`") from error

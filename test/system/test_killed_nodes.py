@@ -103,8 +103,11 @@ class System:
 
     def served(self, map_id: str) -> bool:
         """Whether the map server has all that was published of a map."""
-        known = {tuple(m.index): m.version for m in self.models.values() if m.map_id == map_id}
-        return bool(known) and self.listed() == known and self.map_id == map_id
+        models = [model for model in self.models.values() if model.map_id == map_id]
+        if sum(len(model.data) for model in models) != self.client.statuses[-1].map_bytes:
+            return False
+        known = {tuple(model.index): model.version for model in models}
+        return self.listed() == known and self.map_id == map_id
 
     def settle(self) -> str:
         """Wait until the map is refined, published and served; its identity."""

@@ -23,6 +23,9 @@ from meslam_core.se3 import Pose
 # frames make up for the rest, so many steps each.
 FIRST_STEPS_SHARE = 0.4
 MADE_UP_A_FRAME = 40
+# A region that knows its box is trained beside another one at this share of the
+# learning rate, which evens out what the full rate leaves and forgets nothing for what lies ahead.
+SETTLED_RATE_FACTOR = 0.25
 
 
 class FrameTraining:
@@ -105,6 +108,10 @@ class FrameTraining:
         self.latest = trained
         return True
 
+    def settle(self) -> None:
+        """Wait until the training that runs has ended, without taking up what it did."""
+        self._worker.settle()
+
     def _next_to_train(self) -> list[Region]:
         """The working region, and in turn one of the others that contain the camera.
 
@@ -112,6 +119,7 @@ class FrameTraining:
         """
         others = [region for region in self._atlas.training if region.confirmed]
         self._turn += 1
+        self._atlas.working.has_worked = True
         return [self._atlas.working, *(others[self._turn % len(others)] for _ in others[:1])]
 
     def _train(
@@ -124,10 +132,12 @@ class FrameTraining:
     ) -> Training:
         """Train the working region, which comes first, and the other one half as long."""
         started = time.perf_counter()
-        self._atlas.settle()
+        # While frames wait, either a view is marked or a registration made.
+        registers = self._turn % 2
+        self._atlas.settle(marks=not (registers and self._frames_wait()))
         if keyframe is not None:
             self._registration.add(keyframe)
-        pose = self._registration.proceed() @ pose
+        pose = self._registration.proceed(registers) @ pose
         least = self._config.min_iterations
         losses = self._optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
@@ -139,6 +149,7 @@ class FrameTraining:
                 current,
                 pose,
                 refine_poses=False,
+                rate_factor=SETTLED_RATE_FACTOR if region.settled else 1.0,
                 enough=partial(self._may_end, least // 2),
             )
         return Training(losses, (time.perf_counter() - started) * 1e3)

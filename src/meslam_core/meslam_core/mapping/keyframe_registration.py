@@ -20,8 +20,8 @@ from meslam_core.se3 import Pose, inverse
 
 # A new keyframe: its number, its images and its sample of rays, camera frame.
 NewKeyframe = tuple[int, RgbdFrame, Rays]
-# While frames wait, no more than one registration is made a frame, and this many keyframes may be
-# behind with theirs; then the oldest goes without.
+# While frames wait, so many keyframes may be behind with their registrations; then the oldest goes
+# without.
 KEYFRAMES_BEHIND = 8
 
 
@@ -68,8 +68,11 @@ class KeyframeRegistration:
         self.relocaliser.remember(number)
         self._behind.append(self._registrations(self._linker, number, frame.camera, rays))
 
-    def proceed(self) -> Pose:
+    def proceed(self, least: int = 1) -> Pose:
         """Make the registrations that are due.
+
+        Args:
+            least: so many are made although frames wait.
 
         Returns:
             (4, 4) how that moved the newest keyframe, map frame: the identity, unless a place was
@@ -79,7 +82,7 @@ class KeyframeRegistration:
         newest = len(self._keyframes) - 1
         before = self._keyframes.pose(newest)
         done = 0
-        while self._behind and not (done and self._frames_wait()):
+        while self._behind and not (done >= least and self._frames_wait()):
             if next(self._behind[0], self) is self:
                 self._behind.popleft()
             else:

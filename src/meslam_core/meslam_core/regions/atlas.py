@@ -197,11 +197,14 @@ class RegionAtlas:
     def _half(self) -> float:
         return 0.5 * self.grid.side_m
 
-    def settle(self) -> None:
+    def settle(self, marks: bool = True) -> None:
         """What an update leaves to be done beside tracking, a portion at a time.
 
         Regions near the camera wake, those that were left rest; the keyframes that the active ones
         train on come into memory, all others leave it; masks show what was not marked yet.
+
+        Args:
+            marks: whether masks have their turn.
         """
         kept = self.active
         for index in self._near:
@@ -211,12 +214,14 @@ class RegionAtlas:
                 kept.append(region)
         self._rest_except(kept)
         self._awake = kept
-        for region in kept:
-            if region.confirmed:
+        # While the path may have drifted, what was seen on other parts of it lies elsewhere.
+        if not self.doubtful:
+            for region in kept:
                 self._views.meet(region)
         wanted = [k for region in reversed(kept) for k in region.keyframes]
         self.keyframes.storage.hold(wanted, READ_A_FRAME)
-        self._views.mark(kept, MARKED_A_FRAME)
+        if marks:
+            self._views.mark(kept, MARKED_A_FRAME)
 
     @property
     def doubtful(self) -> list[Region]:
@@ -268,7 +273,7 @@ class RegionAtlas:
         parent.wake()
         region = region_beside(parent, index, self.grid, self.config, self._seed)
         inherited = self.config.regions.initialisation != "random"
-        self._views.assign(region, parent, observed_alike=inherited)
+        self._views.assign(region, parent, observed_alike=inherited, in_doubt=bool(self.doubtful))
         return region
 
     def _wake(self, region: Region) -> None:

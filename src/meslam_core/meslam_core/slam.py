@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,7 +176,8 @@ class Slam:
         enough = len(pixels) >= MIN_FRAME_PIXELS
         if self._view is not None:
             rays = self._sample(frame, pixels, self.config.tracking.points) if enough else None
-            tracked = self.tracking.track(frame.stamp_ns, self._view, rays, odometry)
+            witness = partial(self._seen_from, frame)
+            tracked = self.tracking.track(frame.stamp_ns, self._view, rays, odometry, witness)
             if self.tracking.lost:
                 tracked = self._sought(frame, rays, odometry) or tracked
         elif enough:
@@ -300,6 +302,13 @@ class Slam:
     def online_trajectory(self) -> Trajectory:
         """T_map_camera of every frame as it was known when the frame was done."""
         return self._history.online_trajectory()
+
+    def _seen_from(self, frame: RgbdFrame, T_map_camera: Pose) -> bool | None:
+        """Whether keyframes say that a frame was taken at a pose; None where none can tell."""
+        assert self._training is not None
+        # The images of keyframes belong to the training that runs.
+        self._training.settle()
+        return self._training.relocaliser.confirms(frame, T_map_camera)
 
     def _sought(
         self, frame: RgbdFrame, rays: Rays | None, odometry: OdometryEstimate | None

@@ -57,3 +57,12 @@ def test_frames_without_odometry_break_no_chain_but_keyframes_without_do(store):
     chain.add(2, POSES[2], RAYS, None)
     chain.add(3, POSES[2], RAYS, estimate(2))
     np.testing.assert_array_equal(store.links.all().ends, [[0, 1]])
+
+
+def test_a_chain_that_was_cut_ties_the_next_keyframe_to_none(store):
+    chain = KeyframeChain(store)
+    chain.add(0, POSES[0], RAYS, estimate(0))
+    chain.cut()
+    chain.add(1, POSES[1], RAYS, estimate(1))
+    chain.add(2, POSES[2], RAYS, estimate(2))
+    np.testing.assert_array_equal(store.links.all().ends, [[1, 2]])

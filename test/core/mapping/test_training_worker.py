@@ -87,3 +87,18 @@ def test_closing_waits_for_the_job_and_ends_the_thread():
     worker.close()
     assert done
     assert not threads[0].is_alive()
+
+
+def test_who_waits_for_the_end_leaves_the_result_to_others(worker):
+    worker.settle()
+    training = Training(StepLosses(1.0, 2.0, 3.0, 4), 5.0)
+    ended = threading.Event()
+
+    def job() -> Training:
+        ended.set()
+        return training
+
+    worker.start(job)
+    worker.settle()
+    assert ended.is_set()
+    assert worker.wait() is training

@@ -282,7 +282,8 @@ def test_a_keyframe_that_saw_a_region_at_rest_is_replayed_when_it_wakes(resting)
     far(resting, at(1.2))
     back = path(1)[0]
     back[:3, :3] = back[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
-    back[:3, 3] = at(1.2)
+    back[:3, 3] = at(0.8)
+    far(resting, back[:3, 3])
     number = add_keyframe(resting, back)
     assert number not in resting.regions[(0, 0, 0)].keyframes
     seen_before = resting.regions[(0, 0, 0)].observed().observed_volume_m3
@@ -292,6 +293,8 @@ def test_a_keyframe_that_saw_a_region_at_rest_is_replayed_when_it_wakes(resting)
     resting.regions[(0, 0, 0)].confirmed = True
     far(resting, at(0.55))
     assert number in resting.regions[(0, 0, 0)].keyframes
+    # One view is marked a frame, and the working region has its own.
+    resting.settle()
     assert resting.regions[(0, 0, 0)].mask.observed_volume_m3 > seen_before
 
 
@@ -304,6 +307,43 @@ def test_a_region_that_was_not_recognised_waits_until_the_map_beside_it_ends(res
     assert resting.working.index == (1, 0, 0)
     far(resting, at(-0.1))
     assert resting.working.index == (0, 0, 0)
+
+
+def test_beside_a_region_that_was_not_recognised_a_new_one_takes_up_nothing_from_before(resting):
+    earlier = path(1)[0]
+    earlier[:3, 3] = at(0.55, 0.9)
+    number = resting.keyframes.add(0, earlier, resting.keyframes.all_rays(0))
+    for step in (0.45, 1.2, 0.55):
+        far(resting, at(step))
+    assert resting.doubtful == [resting.regions[(0, 0, 0)]]
+    far(resting, at(0.55, 0.45))
+    child = resting.regions[(1, 1, 0)]
+    assert number not in child.keyframes
+    resting.regions[(0, 0, 0)].confirmed = True
+    far(resting, at(0.55, 0.45))
+    assert number in child.keyframes
+
+
+def test_a_lost_camera_looks_into_one_region_after_the_other_and_enters_its_own(resting):
+    for x in (0.0, 1.0, 2.0, 3.0):
+        resting.update(at(x))
+        resting.settle()
+    first, second = resting.nearest(at(0.1)), resting.nearest(at(1.1))
+    assert (first.index, second.index) == ((0, 0, 0), (1, 0, 0))
+    working = resting.working
+    for region in (first, second):
+        assert region.at_rest
+        resting.look_into(region)
+        assert not region.at_rest
+    assert first.at_rest
+    assert resting.working is working
+    resting.enter(first)
+    assert resting.working is first
+    assert first.confirmed
+    assert not first.at_rest
+    # And that is where it works when the camera moves on.
+    resting.update(at(0.1))
+    assert resting.working is first
 
 
 def test_a_region_that_was_recognised_takes_over_at_once(resting):

@@ -132,6 +132,32 @@ def test_odometry_is_carried_over_a_short_gap_only(history):
     assert history.moved(estimate(np.eye(4))) is None
 
 
+def test_a_path_that_was_broken_off_continues_no_motion_across_the_break(history):
+    filled(history, 3)
+    odometry = [estimate(exp(number * STEP)) for number in range(3)]
+    history.add(3 * PERIOD_NS, START, 0, np.eye(4), odometry[0])
+    history.break_off()
+    found = START @ exp(np.array([5.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
+    assert history.moved(odometry[1]) is None
+    relative = inverse(history.keyframe_pose(0)) @ found
+    history.add(4 * PERIOD_NS, found, 0, relative, odometry[1])
+    # One frame alone stands still; from there on odometry counts again.
+    np.testing.assert_allclose(history.extrapolated(5 * PERIOD_NS), found, atol=1e-6)
+    pose, motion = history.moved(odometry[2])
+    np.testing.assert_allclose(pose, found, atol=1e-6)
+    np.testing.assert_allclose(motion, exp(STEP), atol=1e-9)
+
+
+def test_frames_of_a_lost_camera_are_not_in_the_known_trajectory(history):
+    poses = filled(history, 2)
+    history.add(2 * PERIOD_NS, poses[-1], 0, np.eye(4), None, known=False)
+    history.add(3 * PERIOD_NS, poses[-1], 0, np.eye(4), None)
+    np.testing.assert_array_equal(
+        history.known_trajectory().stamps_ns, [0, PERIOD_NS, 3 * PERIOD_NS]
+    )
+    assert len(history.trajectory()) == 4
+
+
 @pytest.mark.parametrize("count", [64, 65, 200])
 def test_growth_keeps_everything(history, count):
     poses = filled(history, count, 0.1 * STEP)

@@ -50,13 +50,20 @@ class Checked:
         history.add(0, room.poses[0], 0, np.eye(4), None)
 
     def objection(
-        self, pose: Pose, prior: Pose | None = None, rays: Rays | None = None, **found: float
+        self,
+        pose: Pose,
+        prior: Pose | None = None,
+        rays: Rays | None = None,
+        witness: bool | None = None,
+        **found: float,
     ) -> str:
         rays = all_rays(self.room) if rays is None else rays
         alignment = FieldTracker(TrackingConfig()).align(self.room.region, rays, pose)
         alignment = replace(alignment, T_map_camera=pose, **found)
         believed = PosePrior(pose if prior is None else prior, SURE)
-        return self.plausibility.objection(PERIOD_NS, self.room.region, rays, alignment, believed)
+        return self.plausibility.objection(
+            PERIOD_NS, self.room.region, rays, alignment, believed, lambda pose: witness
+        )
 
 
 def moved(room, distance_m: float, degrees: float = 0.0) -> Pose:
@@ -91,12 +98,13 @@ def test_where_odometry_failed_the_map_must_show_the_colours(mapped_room):
     rays = all_rays(mapped_room)
     here = mapped_room.poses[0]
     checked.plausibility.pass_by(odometry(valid=True))
-    assert checked.objection(here, rays=other_colours(rays)) == ""
+    assert checked.objection(here, rays=other_colours(rays), witness=False) == ""
     checked.plausibility.pass_by(odometry(valid=False))
     assert not checked.plausibility.supported
     assert "other colours" in checked.objection(here, rays=other_colours(rays))
     assert "lie on the map" in checked.objection(here, inlier_ratio=0.45)
-    assert checked.objection(here) == ""
+    assert "no keyframe nearby" in checked.objection(here, witness=False)
+    assert checked.objection(here) == checked.objection(here, witness=True) == ""
 
 
 def test_odometry_that_began_anew_supports_nothing_until_the_map_confirms_a_pose(mapped_room):

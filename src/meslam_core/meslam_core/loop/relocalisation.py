@@ -90,6 +90,31 @@ class Relocaliser:
             self._tried.append(keyframe)
         return None
 
+    def confirms(self, frame: RgbdFrame, T_map_camera: Pose) -> bool | None:
+        """Whether the image of a keyframe nearby says that the camera is where it seems to be.
+
+        Args:
+            frame: its images.
+            T_map_camera: (4, 4) where the map has it.
+
+        Returns:
+            None where no keyframe is remembered that could tell.
+        """
+        if self._linker is None or not len(self.places):
+            return None
+        prepared = self._linker.prepare(self._linker.image(frame))
+        poses = self._atlas.keyframes.poses()
+        for keyframe in self.places.nearest(T_map_camera, poses, self._config.candidates):
+            guess = inverse(poses[keyframe]) @ T_map_camera
+            found = self._linker.find(keyframe, prepared, guess)
+            if found is None or not self._looks_alike(found):
+                continue
+            apart = inverse(guess) @ found.T_target_source
+            near = float(np.linalg.norm(apart[:3, 3])) <= self._config.agreement_m
+            if near and rotation_angle(apart) <= np.deg2rad(self._config.agreement_deg):
+                return True
+        return False
+
     def _looks_alike(self, found: Registration) -> bool:
         """Whether two images show the same thing, and not only one of the same shape."""
         limits = self._config

@@ -43,6 +43,11 @@ class TrainingWorker:
         running, self._running = self._running, None
         return None if running is None else running.result()
 
+    def settle(self) -> None:
+        """Wait until the running job has ended; its result stays for `wait`."""
+        if self._running is not None:
+            self._running.exception()
+
     def close(self) -> None:
         """Wait for the job and end the thread."""
         self._threads.shutdown(wait=True)

@@ -15,7 +15,7 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.frame_history import FrameHistory
-from meslam_core.tracking.plausibility import Plausibility
+from meslam_core.tracking.plausibility import Plausibility, Witness
 from meslam_core.tracking.recovery import Recovery
 from meslam_core.tracking.sighting import Sighting
 
@@ -107,7 +107,12 @@ class FrameTracking:
         return TrackedPose(T_map_camera, self._covariance, trusted=True, reason="", alignment=None)
 
     def track(
-        self, stamp_ns: int, region: Region, rays: Rays | None, odometry: OdometryEstimate | None
+        self,
+        stamp_ns: int,
+        region: Region,
+        rays: Rays | None,
+        odometry: OdometryEstimate | None,
+        witness: Witness = lambda pose: None,
     ) -> TrackedPose:
         """Find a frame's pose.
 
@@ -116,6 +121,7 @@ class FrameTracking:
             region: the working region.
             rays: of the frame, camera frame; None where it has too little depth.
             odometry: its estimate, where there is one.
+            witness: tells whether it was taken at a pose; asked where odometry has failed.
         """
         alignment = None
         verdict = _Verdict(trusted=False, reason="too few pixels with depth")
@@ -125,7 +131,7 @@ class FrameTracking:
         prior = self._prior(stamp_ns, odometry)
         if rays is not None:
             alignment = self._align(region, rays, self._guesses(stamp_ns, odometry), prior)
-            verdict = self._judge(stamp_ns, region, rays, alignment, prior, odometry)
+            verdict = self._judge(stamp_ns, region, rays, alignment, prior, witness)
         if alignment is not None and verdict.by_field:
             return self._confirmed(stamp_ns, alignment)
         self._untrusted = 0 if verdict.trusted else self._untrusted + 1
@@ -240,7 +246,7 @@ class FrameTracking:
         rays: Rays,
         alignment: Alignment,
         prior: PosePrior,
-        odometry: OdometryEstimate | None,
+        witness: Witness,
     ) -> _Verdict:
         """Whether an alignment may be trusted, or odometry in its place."""
         limits, plausibility = self.config, self._plausibility
@@ -258,7 +264,7 @@ class FrameTracking:
         if alignment.residual_m > limits.max_residual_m:
             distance = f"{alignment.residual_m * 100:.1f} cm"
             return _Verdict(trusted=False, reason=f"points lie {distance} off the map")
-        objection = plausibility.objection(stamp_ns, region, rays, alignment, prior)
+        objection = plausibility.objection(stamp_ns, region, rays, alignment, prior, witness)
         return _Verdict(trusted=not objection, by_field=not objection, reason=objection)
 
 

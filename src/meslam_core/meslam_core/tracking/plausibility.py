@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from meslam_core.config import TrackingConfig
@@ -22,12 +24,18 @@ NANOSECONDS = 1e-9
 BEGINS_ANEW = 2
 
 
+# Tells whether a frame was taken at a pose (4, 4), by what does not depend on the map's surface;
+# None where it cannot tell.
+Witness = Callable[[Pose], bool | None]
+
+
 class Plausibility:
     """Checks what the map's surface alone does not tell.
 
     A floor fits a floor. As long as valid odometry leads from one trusted pose to the next, the
     pose is where it is said to be within a few centimetres; from the first frame on that odometry
-    could not follow it may be anywhere, and the map has to show the frame's colours, too.
+    could not follow it may be anywhere: then the map has to show the frame's colours, too, and a
+    keyframe nearby its image.
 
     Args:
         config: the limits.
@@ -69,7 +77,13 @@ class Plausibility:
         self._trusted = len(self._history), stamp_ns
 
     def objection(
-        self, stamp_ns: int, region: Region, rays: Rays, alignment: Alignment, prior: PosePrior
+        self,
+        stamp_ns: int,
+        region: Region,
+        rays: Rays,
+        alignment: Alignment,
+        prior: PosePrior,
+        witness: Witness,
     ) -> str:
         """Why a pose that fits the map is not to be trusted; empty where it is.
 
@@ -79,12 +93,13 @@ class Plausibility:
             rays: of the frame, camera frame.
             alignment: with that map.
             prior: what odometry says of the pose, or else the last motion.
+            witness: asked where odometry does not support the pose.
         """
         pose = alignment.T_map_camera
         return (
             self._impossible(stamp_ns, pose)
             or (self.supported and self._conflict(prior, pose))
-            or (not self.supported and self._doubt(region, rays, alignment))
+            or (not self.supported and self._doubt(region, rays, alignment, witness))
             or ""
         )
 
@@ -112,7 +127,7 @@ class Plausibility:
             return f"the map has the camera {apart} from where odometry has it"
         return ""
 
-    def _doubt(self, region: Region, rays: Rays, alignment: Alignment) -> str:
+    def _doubt(self, region: Region, rays: Rays, alignment: Alignment, witness: Witness) -> str:
         """Why the map alone does not tell enough; where there never was odometry it has to."""
         limits = self._config
         if not self._has_odometry:
@@ -123,6 +138,8 @@ class Plausibility:
         likeness = colour_likeness(region, rays, alignment.T_map_camera)
         if likeness is not None and likeness < limits.doubted_colour_likeness:
             return "the map has other colours here, and odometry has failed"
+        if witness(alignment.T_map_camera) is False:
+            return "no keyframe nearby looks like this, and odometry has failed"
         return ""
 
 

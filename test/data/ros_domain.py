@@ -1,11 +1,12 @@
-"""A ROS domain of the test session's own, on this computer alone."""
+"""ROS domains of the test session's own, on this computer alone."""
 
 from __future__ import annotations
 
 import os
 
 # Domains above 101 may collide with the ports that Linux hands out to other programs.
-DOMAIN = 1 + os.getpid() % 101
+DOMAIN = 1 + 2 * (os.getpid() % 50)
+OTHER_DOMAIN = DOMAIN + 1
 
 
 def enter() -> None:

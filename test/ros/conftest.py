@@ -38,9 +38,9 @@ def start_node() -> Iterator[Callable[..., ManagedNode]]:
     """Starts nodes of this package and spins them in the background until the test ends."""
     running: list[tuple[ManagedNode, MultiThreadedExecutor, threading.Thread]] = []
 
-    def start(kind: type[ManagedNode], **parameters: Any) -> ManagedNode:
+    def start(kind: type[ManagedNode], namespace: str = "", **parameters: Any) -> ManagedNode:
         named = {name.replace("__", "."): value for name, value in parameters.items()}
-        node = kind(parameter_overrides=overrides(named))
+        node = kind(parameter_overrides=overrides(named), namespace=namespace)
         executor = MultiThreadedExecutor(EXECUTOR_THREADS)
         executor.add_node(node)
         thread = threading.Thread(target=executor.spin, daemon=True)

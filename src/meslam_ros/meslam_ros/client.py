@@ -28,6 +28,11 @@ POLL_S = 0.05
 class MeslamClient:
     """Listens to a running system in a context of its own.
 
+    Args:
+        name: of the node.
+        namespace: of the system.
+        domain_id: of the system; by default that of the environment.
+
     Attributes:
         node: for further subscriptions.
         poses: T_map_base (4, 4) by stamp [ns], from /meslam/pose.
@@ -36,10 +41,12 @@ class MeslamClient:
         regions: the latest of /meslam/regions.
     """
 
-    def __init__(self, name: str = "meslam_client") -> None:
+    def __init__(
+        self, name: str = "meslam_client", namespace: str = "", domain_id: int | None = None
+    ) -> None:
         self._context = Context()
-        rclpy.init(context=self._context)
-        self.node = Node(name, context=self._context)
+        rclpy.init(context=self._context, domain_id=domain_id)
+        self.node = Node(name, context=self._context, namespace=namespace)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self.poses: dict[int, se3.Pose] = {}

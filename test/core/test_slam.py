@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from meslam_core.evaluation.covariance import calibration
 from meslam_core.evaluation.trajectory_error import absolute_error
 from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import make_odometry
@@ -54,6 +55,25 @@ def test_every_frame_has_a_result_that_says_how_it_went(walked, room_frames):
         assert result.losses.total > 0
         assert result.losses.steps > 0
         assert result.reason == ""
+
+
+def test_the_covariance_tells_how_far_the_pose_is_off(walked, room_poses):
+    _, results = walked
+    shifts = np.array([result.T_map_camera[:3, 3] for result in results[1:]])
+    shifts -= np.array(room_poses)[1:, :3, 3]
+    found = calibration(shifts, np.array([r.covariance[:3, :3] for r in results[1:]]))
+    assert found.held > 0.8
+    # This camera is without any error, which nothing but a truth can tell.
+    assert found.predicted < 0.04
+
+
+def test_the_covariance_grows_while_the_view_is_covered(quick_config, room_frames):
+    frames = list(room_frames[:10])
+    frames[5:9] = [covered(frame) for frame in frames[5:9]]
+    deviations = [np.sqrt(np.trace(r.covariance[:3, :3])) for r in walk(Slam(quick_config), frames)]
+    assert (np.diff(deviations[4:9]) > 0).all()
+    assert deviations[8] > 2 * deviations[4]
+    assert deviations[9] < deviations[8]
 
 
 def test_the_map_starts_about_the_first_camera(walked, room_poses):

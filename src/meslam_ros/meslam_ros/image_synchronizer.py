@@ -55,6 +55,13 @@ class ImageSynchronizer:
         self._last_pair_ns: int | None = None
 
     @property
+    def apart_s(self) -> float | None:
+        """By how much the stamps of the newest images differ [s]; None without one of both."""
+        if not self._color or not self._depth:
+            return None
+        return abs(self._color[-1][0] - self._depth[-1][0]) / NANOSECONDS
+
+    @property
     def _tolerance_ns(self) -> int:
         return round(self.tolerance_s * NANOSECONDS)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -73,6 +74,7 @@ class MatchedSubscription:
 
     Attributes:
         topic: full name, remapped.
+        type_name: of its messages.
         received: number of messages so far.
     """
 
@@ -80,7 +82,9 @@ class MatchedSubscription:
         self, node: Node, message_type: type, topic: str, callback: Callable[[Any], None]
     ) -> None:
         self.topic = node.resolve_topic_name(topic)
+        self.type_name = f"{message_type.__module__.split('.')[0]}/msg/{message_type.__name__}"
         self.received = 0
+        self._received_s = time.monotonic()
         self._node = node
         self._type = message_type
         self._callback = callback
@@ -91,6 +95,16 @@ class MatchedSubscription:
     def publishers(self) -> list[TopicEndpointInfo]:
         """Who publishes the topic now."""
         return self._node.get_publishers_info_by_topic(self.topic)
+
+    @property
+    def other_types(self) -> list[str]:
+        """Types that publishers of the topic send instead of the one that is wanted."""
+        return sorted({p.topic_type for p in self.publishers} - {self.type_name})
+
+    @property
+    def silence_s(self) -> float:
+        """Time since the last message [s]."""
+        return time.monotonic() - self._received_s
 
     def update(self) -> None:
         """Follow the publishers that the graph shows."""
@@ -117,4 +131,5 @@ class MatchedSubscription:
 
     def _received(self, message: Any) -> None:
         self.received += 1
+        self._received_s = time.monotonic()
         self._callback(message)

@@ -20,6 +20,7 @@ from meslam_core.se3 import Pose
 from meslam_ros import topics
 from meslam_ros.conversions import camera_from_info, color_image, depth_image
 from meslam_ros.image_synchronizer import ImagePair, ImageSynchronizer
+from meslam_ros.input_silence import InputSilence
 from meslam_ros.node_settings import FrameSettings, InputSettings
 from meslam_ros.qos import MatchedSubscription, describe
 from meslam_ros.transforms import BaseFrame, CameraMount, StaticTransforms
@@ -88,8 +89,9 @@ class RgbdInput:
             node, CameraInfo, topics.DEPTH_INFO, lambda m: self._infos.__setitem__("depth", m)
         )
         self._subscriptions = (self._color, self._depth, self._color_info, self._depth_info)
-        self._last_pair_s = time.monotonic()
-        self._next_report_s = settings.input_timeout_s
+        self._silence = InputSilence(
+            node, self._color, self._depth, self._color_info, self._synchronizer, settings
+        )
         self._timer = node.create_timer(GRAPH_PERIOD_S, self._watch, clock=STEADY)
 
     def close(self) -> None:
@@ -205,7 +207,7 @@ class RgbdInput:
             raise FrameError(
                 f"depth is in the frame {depth_frame!r}, colour in {color_frame!r}, and "
                 "/tf_static does not connect them; publish the transform, or start the camera "
-                "with align_depth.enable:=true"
+                f"with align_depth.enable:=true{self.transforms.complaint()}"
             )
         return T_color_depth
 
@@ -219,48 +221,14 @@ class RgbdInput:
 
     def _hand_over(self, pair: ImagePair) -> None:
         self.pairs += 1
-        self._last_pair_s = time.monotonic()
+        self._silence.heard()
         self._on_pair(pair)
 
     def _watch(self) -> None:
         self._synchronizer.tolerance_s = self._settings.sync_tolerance_s
         for subscription in self._subscriptions:
             subscription.update()
-        silence_s = time.monotonic() - self._last_pair_s
-        if silence_s < self._settings.input_timeout_s:
-            self._next_report_s = self._settings.input_timeout_s
-        elif silence_s >= self._next_report_s:
-            self._next_report_s = 2.0 * silence_s
-            self._node.get_logger().warn(self.waiting_for(silence_s))
-
-    def waiting_for(self, silence_s: float) -> str:
-        """What is missing, for people: topics, publishers and the likely cause."""
-        lines = [f"no image pair for {silence_s:.0f} s; waiting for:"]
-        for subscription in self._subscriptions[:3]:
-            lines.append(
-                f"  {subscription.topic}: {describe(subscription.publishers)}, "
-                f"{subscription.received} messages"
-            )
-        lines.append(f"  likely cause: {self._likely_cause()}")
-        return "\n".join(lines)
-
-    def _likely_cause(self) -> str:
-        silent = [s.topic for s in self._subscriptions[:3] if not s.publishers]
-        if len(silent) == 3 and self.pairs:
-            return "the camera or player has ended"
-        if len(silent) == 3:
-            return "the camera or player is not running, or its topics have other names (remap)"
-        if silent:
-            return f"nobody publishes {', '.join(silent)}: another name (remap), or not enabled"
-        mute = [s.topic for s in self._subscriptions[:2] if not s.received]
-        if mute:
-            return f"{', '.join(mute)}: announced but nothing arrives; is the camera paused?"
-        if self.pairs == 0:
-            return (
-                "colour and depth stamps differ by more than sync_tolerance_s = "
-                f"{self._settings.sync_tolerance_s}"
-            )
-        return "the camera or player has paused"
+        self._silence.watch()
 
     def _publishers(self, topic: str) -> list:
         return self._node.get_publishers_info_by_topic(topic)

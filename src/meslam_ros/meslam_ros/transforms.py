@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
 from tf2_msgs.msg import TFMessage
 
 from meslam_core import se3
@@ -20,7 +21,7 @@ from meslam_core.errors import FrameError
 from meslam_core.recordings.transforms import FrameTree
 from meslam_ros import topics
 from meslam_ros.conversions import to_stamp, to_transform
-from meslam_ros.qos import STREAM, latched
+from meslam_ros.qos import STREAM, describe, latched
 
 STATIC_DEPTH = 100
 
@@ -49,6 +50,17 @@ class StaticTransforms:
             frame = self._parents[frame]
             visited.add(frame)
         return frame
+
+    def complaint(self) -> str:
+        """Why transforms that are sent may not arrive, for people; empty where none is seen."""
+        publishers = self._node.get_publishers_info_by_topic(topics.TF_STATIC)
+        volatile = [p for p in publishers if p.qos_profile.durability == DurabilityPolicy.VOLATILE]
+        if not volatile:
+            return ""
+        return (
+            f" (/tf_static has {describe(volatile)} that sends it as volatile, so that nobody who "
+            "wants it latched gets it; let that send it transient local)"
+        )
 
     def close(self) -> None:
         """Stop listening."""
@@ -129,7 +141,7 @@ class BaseFrame:
                 self._warn(
                     f"/tf_static does not connect {optical_frame!r} to the base frame "
                     f"{self._wanted!r}: the optical frame itself is the base now. Publish the "
-                    "transform, or set base_frame"
+                    f"transform, or set base_frame{self._transforms.complaint()}"
                 )
             self._mount = CameraMount(optical_frame, optical_frame, np.eye(4))
         return self._mount

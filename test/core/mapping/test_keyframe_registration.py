@@ -10,6 +10,7 @@ import torch
 from data.textured_room import CAMERA, frame_at, path
 
 from meslam_core.config import MeslamConfig
+from meslam_core.mapping import keyframe_registration
 from meslam_core.mapping.keyframe_registration import KEYFRAMES_BEHIND, KeyframeRegistration
 from meslam_core.mapping.keyframes import KeyframeStore, rays_at
 from meslam_core.regions.atlas import RegionAtlas
@@ -79,6 +80,15 @@ def test_what_was_put_off_is_made_up_for(at_once):
     motion = arriving.registration.proceed()
     assert arriving.links == at_once
     np.testing.assert_array_equal(motion, np.eye(4))
+
+
+def test_while_frames_wait_a_keyframe_is_not_registered_with_many(monkeypatch):
+    monkeypatch.setattr(keyframe_registration, "LEAST_ATTEMPTS", 2)
+    arriving = Arriving(lambda: True)
+    arriving.add(5)
+    for _ in range(20):
+        arriving.registration.proceed()
+    assert [arriving.linked.count(number) for number in range(5)] == [0, 1, 2, 2, 2]
 
 
 def test_only_so_many_keyframes_are_behind_with_their_registrations():

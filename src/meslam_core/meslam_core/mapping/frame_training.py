@@ -137,7 +137,7 @@ class FrameTraining:
         self._atlas.settle(marks=not (registers and self._frames_wait()))
         if keyframe is not None:
             self._registration.add(keyframe)
-        pose = self._registration.proceed(registers) @ pose
+            pose = self._registration.proceed(registers) @ pose
         least = self._config.min_iterations
         losses = self._optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
@@ -152,6 +152,8 @@ class FrameTraining:
                 rate_factor=SETTLED_RATE_FACTOR if region.settled else 1.0,
                 enough=partial(self._may_end, least // 2),
             )
+        if keyframe is None:
+            self._registration.proceed(registers)
         return Training(losses, (time.perf_counter() - started) * 1e3)
 
     def _train_first(self) -> Training:

@@ -20,8 +20,9 @@ from meslam_core.se3 import Pose, inverse
 
 # A new keyframe: its number, its images and its sample of rays, camera frame.
 NewKeyframe = tuple[int, RgbdFrame, Rays]
-# While frames wait, so many keyframes may be behind with their registrations; then the oldest goes
-# without.
+# While frames wait, a keyframe is registered with so many older ones at most, and so many keyframes
+# may be behind with that; then the oldest goes without.
+LEAST_ATTEMPTS = 3
 KEYFRAMES_BEHIND = 8
 
 
@@ -98,11 +99,13 @@ class KeyframeRegistration:
     def _registrations(
         self, linker: CovisibilityLinker, number: int, camera: PinholeCamera, rays: Rays
     ) -> Iterator[None]:
-        """One registration after the other."""
-        for link in linker.link(number, camera, rays):
-            if link is not None:
-                self._keyframes.add_link(link.first, link.second, link.T_first_second)
-            yield
+        """One registration after the other: where it is, and then what else it sees."""
         if self.recogniser is not None:
             for region in self._atlas.doubtful[:1]:
                 yield from self.recogniser.ask(region, number, camera, rays)
+        for attempt, link in enumerate(linker.link(number, camera, rays), 1):
+            if link is not None:
+                self._keyframes.add_link(link.first, link.second, link.T_first_second)
+            yield
+            if attempt >= LEAST_ATTEMPTS and self._frames_wait():
+                return

@@ -7,6 +7,7 @@ import pytest
 import yaml
 from std_srvs.srv import SetBool
 
+from meslam_interfaces.msg import RegionIndex
 from meslam_interfaces.srv import ExportMap, QueryOccupancy
 from meslam_ros.call_service import CallError, fill, run, shown
 from meslam_ros.map_server_node import MapServerNode
@@ -81,3 +82,4 @@ def test_long_arrays_are_shortened() -> None:
     response = QueryOccupancy.Response(probability=[0.5] * 100)
     assert shown(response)["probability"][-1] == "... and 90 more"
     assert shown(response)["result"] == 0
+    assert shown(RegionIndex(index=[1, -2, 3])) == {"index": [1, -2, 3]}

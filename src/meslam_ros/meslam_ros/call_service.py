@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import yaml
 
 from meslam_core.errors import MeslamError
@@ -76,6 +77,8 @@ def shown(message: Any) -> Any:
     if hasattr(message, "get_fields_and_field_types"):
         names = message.get_fields_and_field_types()
         return {name: shown(getattr(message, name)) for name in names}
+    if isinstance(message, np.generic):
+        return message.item()
     if isinstance(message, (str, bool, int, float)):
         return message
     entries = [shown(entry) for entry in list(message[:SHOWN_ENTRIES])]

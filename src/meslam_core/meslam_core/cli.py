@@ -151,8 +151,8 @@ def run(
     """Track and map a recording.
 
     RECORDING is a rosbag2 folder, an .mcap, .db3 or .bag file, a TUM folder, or a folder with
-    color/, depth/ and camera.json. Writes trajectory.txt, trajectory_online.txt, map.meslam and
-    report.json.
+    color/, depth/ and camera.json. Writes trajectory.txt, trajectory_online.txt with
+    covariance_online.txt, map.meslam and report.json.
     """
     from meslam_core.config import MeslamConfig
 

@@ -311,7 +311,7 @@ def test_a_region_that_was_not_recognised_waits_until_the_map_beside_it_ends(res
 
 def test_beside_a_region_that_was_not_recognised_a_new_one_takes_up_nothing_from_before(resting):
     earlier = path(1)[0]
-    earlier[:3, 3] = at(0.55, 0.9)
+    earlier[:3, 3] = at(0.55, 1.2)
     number = resting.keyframes.add(0, earlier, resting.keyframes.all_rays(0))
     for step in (0.45, 1.2, 0.55):
         far(resting, at(step))

@@ -61,6 +61,7 @@ class Region:
     Attributes:
         seen: keyframes below this number have been asked whether they see the region.
         unmarked: keyframes whose views the mask does not show yet.
+        has_worked: whether it was the working region in this session.
         confirmed: whether the camera is known to be where this region's map has it; after a rest
             the path may have drifted.
         known_until: keyframes below this number are from before that rest.
@@ -85,6 +86,7 @@ class Region:
         self.version = version
         self.seen = 0
         self.unmarked: list[int] = []
+        self.has_worked = False
         self.confirmed = True
         self.known_until = 0
         self.doubts = 0
@@ -93,6 +95,11 @@ class Region:
         self._field: FieldModel | None = field
         self._mask: ObservedMask | None = mask
         self._rest: _Rest | None = None
+
+    @property
+    def settled(self) -> bool:
+        """Whether it knows its box: it has worked, in this session or an earlier one."""
+        return self.has_worked or self.origin is not None
 
     @property
     def untouched(self) -> bool:

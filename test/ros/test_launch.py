@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -162,6 +164,18 @@ def test_what_is_planned_runs(client, tmp_path: Path) -> None:
     finally:
         for process in processes.values():
             process.stop()
+
+
+def test_plan_needs_no_package_of_the_virtual_environment() -> None:
+    """`ros2 launch` runs in the system's Python."""
+    script = (
+        "import sys; before = set(sys.modules); import meslam_ros.launch_plan; "
+        "print(*{name.partition('.')[0] for name in set(sys.modules) - before})"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert set(result.stdout.split()) <= {*sys.stdlib_module_names, "meslam_ros"}
 
 
 def launch_module() -> Any:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from meslam_core.errors import MapError
+from meslam_core.map.lattice import cell_numbers, numbered_cells, unique_cells
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.map.triangle_mesh import TriangleMesh, without_shards
@@ -97,12 +98,17 @@ def _near_blocks(
     for region in regions:
         mask = region.stored.mask
         centers = region.observed_centers(near_surface=True)
+        if not len(centers):
+            continue
         reach = 0.5 * mask.voxel_m * np.abs(region.rotation).sum(axis=1) + resolution
         low = np.floor((centers - reach) / side).astype(np.int64)
-        spread = np.floor((centers + reach) / side).astype(np.int64) - low
-        for step in product(*(range(int(n) + 1) for n in spread.max(axis=0, initial=0))):
-            found.append(np.unique((low + np.array(step))[(spread >= step).all(axis=1)], axis=0))
-    blocks = np.unique(np.concatenate(found), axis=0)
+        high = np.floor((centers + reach) / side).astype(np.int64)
+        first = low.min(axis=0)
+        near = np.zeros(high.max(axis=0) - first + 1, bool)
+        for step in product(*(range(int(n) + 1) for n in (high - low).max(axis=0))):
+            near[tuple((np.minimum(low + np.array(step), high) - first).T)] = True
+        found.append(np.argwhere(near) + first)
+    blocks = unique_cells(np.concatenate(found))
     if box is not None:
         above = (blocks + 1) * side >= np.asarray(box[0])
         blocks = blocks[(above & (blocks * side <= np.asarray(box[1]))).all(axis=1)]
@@ -113,10 +119,11 @@ def _tiles(blocks: NDArray[np.int64]) -> dict[Block, NDArray[np.int64]]:
     """Blocks (N, 3) by the tile they belong to."""
     if not len(blocks):
         return {}
-    tiles, member = np.unique(blocks // TILE_BLOCKS, axis=0, return_inverse=True)
-    member = member.reshape(-1)
+    numbers = cell_numbers(blocks // TILE_BLOCKS)
     return {
-        (int(x), int(y), int(z)): blocks[member == number] for number, (x, y, z) in enumerate(tiles)
+        (int(x), int(y), int(z)): blocks[numbers == number]
+        for number in np.unique(numbers)
+        for x, y, z in numbered_cells(number[None])
     }
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from meslam_core.config import MapConfig
 from meslam_core.errors import MapError
 from meslam_core.field.rendering import surface_level
+from meslam_core.map.lattice import unique_cells
 from meslam_core.map.placed_region import PlacedRegion, Points
 from meslam_core.map.reader import read_map
 from meslam_core.map.stored_region import StoredRegion
@@ -104,7 +105,7 @@ class NeuralMap:
         """Volume that any region observed, counted once [m^3]; good to a voxel at borders."""
         voxel_m = min(region.stored.mask.voxel_m for region in self.regions)
         seen = [np.floor(region.observed_centers() / voxel_m) for region in self.regions]
-        return float(len(np.unique(np.concatenate(seen).astype(np.int32), axis=0))) * voxel_m**3
+        return float(len(unique_cells(np.concatenate(seen).astype(np.int64)))) * voxel_m**3
 
     def subset(self, indices: Iterable[RegionIndex]) -> list[PlacedRegion]:
         """The regions with the given places on the lattice.
@@ -223,23 +224,31 @@ class NeuralMap:
             flags |= seen
             located.append((region, local, seen & OBSERVED > 0))
         wanted = flags & (NEAR_SURFACE if near_only else OBSERVED) > 0
+        chosen = []
         total = np.zeros(len(points))
-        mean = np.zeros((len(points), 7 if gradient else 4))
         for region, local, observed in located:
-            chosen = np.flatnonzero(observed & wanted)
-            if not len(chosen):
-                continue
-            local = local[chosen]
-            values: NDArray[np.floating] = (
-                np.concatenate(region.gradient(local), axis=1)
+            rows = np.flatnonzero(observed & wanted)
+            if len(rows):
+                local = local[rows] if len(rows) < len(points) else local
+                weight = np.exp(region.log_weight(local, self.config.blend_length))
+                total[rows] += weight
+                chosen.append((region, local, rows, weight))
+        result = np.zeros((len(points), 7 if gradient else 4), np.float32)
+        for region, local, rows, weight in chosen:
+            values = (
+                np.concatenate(region.gradient(local), axis=1, dtype=np.float32)
                 if gradient
                 else region.predict(local)
             )
-            weight = np.exp(region.log_weight(local, self.config.blend_length))
-            total[chosen] += weight
-            mean[chosen] += weight[:, None] * values
-        with np.errstate(invalid="ignore"):
-            return flags, (mean / total[:, None]).astype(np.float32)
+            if len(chosen) > 1:
+                values *= (weight / total[rows]).astype(np.float32)[:, None]
+            if len(rows) < len(points):
+                values += result.take(rows, axis=0)
+                result[rows] = values
+            else:
+                result += values
+        result[total == 0.0] = np.nan
+        return flags, result
 
 
 def _checked(points: Points) -> NDArray[np.float64]:

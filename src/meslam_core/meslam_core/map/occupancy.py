@@ -13,6 +13,7 @@ from meslam_core.map.neural_map import FREE, OCCUPIED, UNKNOWN, NeuralMap
 MAX_CELLS = 1 << 24
 MAX_LEVELS = 1000
 TILE_CELLS = 48
+LEVELS_AT_ONCE = 8
 
 
 @dataclass(frozen=True)
@@ -97,12 +98,19 @@ def _project(
     high = np.array([x[-1], y[-1], heights[-1]])
     if not neural_map.touching(low, high):
         return result
-    # Level by level, so that memory does not grow with the layer's thickness.
+    # Some levels at a time, so that memory does not grow with the layer's thickness; what has been
+    # found occupied stays so.
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    for height in heights:
-        points = np.column_stack([grid, np.full(len(grid), height)])
-        state = neural_map.occupancy(points, voxel_m=resolution_m)[0].reshape(shape)
-        np.maximum(result, state, out=result)
+    states = result.reshape(-1)
+    for start in range(0, len(heights), LEVELS_AT_ONCE):
+        chosen = heights[start : start + LEVELS_AT_ONCE]
+        open_cells = np.flatnonzero(states < OCCUPIED)
+        points = np.empty((len(chosen), len(open_cells), 3))
+        points[:, :, :2] = grid[open_cells]
+        points[:, :, 2] = chosen[:, None]
+        state = neural_map.occupancy(points.reshape(-1, 3), voxel_m=resolution_m)[0]
+        highest = state.reshape(len(chosen), -1).max(axis=0)
+        states[open_cells] = np.maximum(states[open_cells], highest)
     return result
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from meslam_core.errors import MapError
+from meslam_core.map.lattice import cell_numbers
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.placed_region import PlacedRegion
 
@@ -174,9 +175,8 @@ def _near(neural_map: NeuralMap, centers: NDArray[np.float64], side_m: float) ->
 
 def _one_a_cube(points: Floats, spacing_m: float) -> NDArray[np.intp]:
     """Numbers of points (N, 9), one for each cube of the spacing that holds any."""
-    cubes = np.floor(points[:, :3] / spacing_m).astype(np.int64) + (1 << 20)
-    numbers = (cubes[:, 0] << 42) | (cubes[:, 1] << 21) | cubes[:, 2]
-    return np.unique(numbers, return_index=True)[1]
+    cubes = np.floor(points[:, :3] / spacing_m).astype(np.int64)
+    return np.unique(cell_numbers(cubes), return_index=True)[1]
 
 
 def _on_surface(neural_map: NeuralMap, points: NDArray[np.floating], reach_m: float) -> Floats:

@@ -35,8 +35,10 @@ class TriangleMesh:
         for start in range(0, len(areas), BATCH):
             corners = self.vertices[self.triangles[start : start + BATCH]].astype(np.float64)
             edges = corners[:, 1:] - corners[:, :1]
-            doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-            areas[start : start + BATCH] = 0.5 * doubled
+            # Written out: numpy's cross product takes three times as long.
+            (a, b, c), (d, e, f) = edges[:, 0].T, edges[:, 1].T
+            squares = (b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2
+            areas[start : start + BATCH] = 0.5 * np.sqrt(squares)
         return areas
 
     def selected(self, triangles: NDArray[np.bool_]) -> TriangleMesh:

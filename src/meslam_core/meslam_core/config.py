@@ -258,7 +258,7 @@ class RelocalisationConfig:
     """How a camera that was lost is found again in the map."""
 
     keyframes: int = setting(
-        1000, "keyframes whose looks are remembered, 3.2 kB each", minimum=1, maximum=100000
+        1000, "keyframes whose looks are remembered, 4.4 kB each", minimum=1, maximum=100000
     )
     candidates: int = setting(
         2, "keyframes that a lost frame is compared with", minimum=0, maximum=100

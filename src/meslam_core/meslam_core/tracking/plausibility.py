@@ -19,9 +19,6 @@ from meslam_core.tracking.frame_history import FrameHistory
 MOTION_SLACK_M = 0.05
 MOTION_SLACK_RAD = 0.05
 NANOSECONDS = 1e-9
-# Registered odometry keeps its keyframe over a single failure; after so many in a row it begins
-# anew wherever the camera is then.
-BEGINS_ANEW = 2
 
 
 # Tells whether a frame was taken at a pose (4, 4), by what does not depend on the map's surface;
@@ -51,7 +48,6 @@ class Plausibility:
         self._config = config
         self._history = history
         self._followed = True
-        self._failures = 0
         self._has_odometry = False
         self._trusted: tuple[int, int] | None = None
 
@@ -64,10 +60,10 @@ class Plausibility:
         """Note a frame's odometry."""
         valid = odometry is not None and odometry.valid
         self._has_odometry = self._has_odometry or valid
-        self._failures = 0 if valid else self._failures + 1
-        # Any two poses from elsewhere tell the motion between them, whatever was in between.
+        # Any two poses from elsewhere tell the motion between them, whatever was in between; after
+        # a failure of registration the next one may begin at a frame that it knows no pose of.
         registered = odometry is None or odometry.noise is None
-        if registered and self._failures >= BEGINS_ANEW:
+        if registered and not valid:
             self._followed = False
         self.supported = valid and self._followed
 

@@ -211,10 +211,12 @@ def verdict(results: list[dict[str, Any]]) -> str:
 
 def radii(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
     """How far the 95 % ellipsoids (N, 3, 3) reach in the direction of the errors (N, 3)."""
-    whitened = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
-    squared = np.maximum(np.einsum("ni,ni->n", errors, whitened), np.finfo(float).tiny)
-    lengths: np.ndarray = np.linalg.norm(errors, axis=1)
-    return lengths * np.sqrt(chi2.ppf(CONFIDENCE, 3) / squared)
+    # An error of nothing has no direction.
+    errors = errors + 1e-12
+    directions = errors / np.linalg.norm(errors, axis=1)[:, None]
+    whitened = np.linalg.solve(covariances, directions[:, :, None])[:, :, 0]
+    reach: np.ndarray = np.sqrt(chi2.ppf(CONFIDENCE, 3) / (directions * whitened).sum(axis=1))
+    return reach
 
 
 def plot(

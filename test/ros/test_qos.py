@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import pytest
 import rclpy
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy
 from std_msgs.msg import String
 
@@ -66,6 +67,34 @@ def test_second_publisher_with_less_to_offer_is_heard_too(
     for publisher in publishers:
         publisher.publish(String(data="image"))
     assert client.spin_until(lambda: len(received) == 2, 5.0)
+
+
+def test_messages_that_do_not_arrive_are_counted(driver: Node, client: MeslamClient) -> None:
+    received: list[String] = []
+    subscription = MatchedSubscription(client.node, String, TOPIC, received.append)
+
+    def ready(publisher: Publisher) -> bool:
+        subscription.update()
+        return publisher.get_subscription_count() == 1 and len(subscription.publishers) == 1
+
+    publisher = driver.create_publisher(String, TOPIC, images(RELIABLE))
+    assert client.spin_until(lambda: ready(publisher), 5.0)
+    subscription.update()
+    publisher.publish(String(data="first"))
+    assert client.spin_until(lambda: len(received) == 1, 5.0)
+    # Nobody takes them meanwhile, and the subscription keeps the last ten.
+    for number in range(30):
+        publisher.publish(String(data=str(number)))
+    assert client.spin_until(lambda: bool(received) and received[-1].data == "29", 5.0)
+    assert subscription.lost == 31 - subscription.received > 0
+    # Another publisher counts for itself.
+    lost = subscription.lost
+    driver.destroy_publisher(publisher)
+    again = driver.create_publisher(String, TOPIC, images(RELIABLE))
+    assert client.spin_until(lambda: ready(again), 5.0)
+    again.publish(String(data="again"))
+    assert client.spin_until(lambda: received[-1].data == "again", 5.0)
+    assert subscription.lost == lost
 
 
 def test_publishers_are_described_for_people(driver: Node, client: MeslamClient) -> None:

@@ -126,6 +126,7 @@ class OdometryNode(ManagedNode):
                 "image_pairs": worker.input.pairs,
                 "queue_length": worker.waiting,
                 "dropped": dropped or "none",
+                "lost": counts(worker.input.lost) or "none",
             },
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -76,6 +76,7 @@ class MatchedSubscription:
         topic: full name, remapped.
         type_name: of its messages.
         received: number of messages so far.
+        lost: number of messages that its one publisher sent and that did not arrive.
     """
 
     def __init__(
@@ -83,7 +84,9 @@ class MatchedSubscription:
     ) -> None:
         self.topic = node.resolve_topic_name(topic)
         self.type_name = f"{message_type.__module__.split('.')[0]}/msg/{message_type.__name__}"
-        self.received = 0
+        self.received = self.lost = 0
+        self._number = 0
+        self._publisher_count = 0
         self._received_s = time.monotonic()
         self._node = node
         self._type = message_type
@@ -109,6 +112,7 @@ class MatchedSubscription:
     def update(self) -> None:
         """Follow the publishers that the graph shows."""
         publishers = self.publishers
+        self._publisher_count = len(publishers)
         if not publishers:
             return
         reliability = matching_reliability(publishers)
@@ -129,7 +133,12 @@ class MatchedSubscription:
             self._node.destroy_subscription(self._subscription)
         self._subscription = self._reliability = None
 
-    def _received(self, message: Any) -> None:
+    def _received(self, message: Any, info: Mapping[str, Any]) -> None:
+        number = info["publication_sequence_number"] or 0
+        # Two publishers count apart, and one that was started again begins anew.
+        if self._publisher_count == 1 and 0 < self._number < number:
+            self.lost += number - self._number - 1
+        self._number = number
         self.received += 1
         self._received_s = time.monotonic()
         self._callback(message)

@@ -19,6 +19,7 @@ from meslam_core.recordings.lens import Lens
 from meslam_core.se3 import Pose
 from meslam_ros import topics
 from meslam_ros.conversions import camera_from_info, color_image, depth_image
+from meslam_ros.diagnostics import counts
 from meslam_ros.image_synchronizer import ImagePair, ImageSynchronizer
 from meslam_ros.input_silence import InputSilence
 from meslam_ros.node_settings import FrameSettings, InputSettings
@@ -28,6 +29,11 @@ from meslam_ros.transforms import BaseFrame, CameraMount, StaticTransforms
 GRAPH_PERIOD_S = 0.2
 INFO_TIMEOUT_S = 0.3
 SAME_INTRINSICS_PX = 0.5
+LOST_PERIOD_S = 10.0
+LOST_REMEDY = (
+    "load config/fastdds.xml in both programs (FASTRTPS_DEFAULT_PROFILES_FILE), let the camera "
+    "send reliably, or give the nodes more processor time"
+)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
@@ -92,6 +98,7 @@ class RgbdInput:
         self._silence = InputSilence(
             node, self._color, self._depth, self._color_info, self._synchronizer, settings
         )
+        self._lost = 0
         self._timer = node.create_timer(GRAPH_PERIOD_S, self._watch, clock=STEADY)
 
     def close(self) -> None:
@@ -105,6 +112,16 @@ class RgbdInput:
     def losses(self) -> Counter[str]:
         """Images that were not used, by reason."""
         return +(self._synchronizer.dropped + self.dropped)
+
+    @property
+    def lost(self) -> Counter[str]:
+        """Images that were sent and did not arrive, by kind."""
+        return +Counter(
+            {
+                "colour images lost on the way": self._color.lost,
+                "depth images lost on the way": self._depth.lost,
+            }
+        )
 
     def mount(self, pair: ImagePair) -> CameraMount | None:
         """Where the pair's camera sits on the base; None while /tf_static may still tell.
@@ -229,6 +246,12 @@ class RgbdInput:
         for subscription in self._subscriptions:
             subscription.update()
         self._silence.watch()
+        lost = self.lost.total()
+        if lost > self._lost:
+            self._lost = lost
+            self._node.get_logger().warn(
+                f"{counts(self.lost)}; {LOST_REMEDY}", throttle_duration_sec=LOST_PERIOD_S
+            )
 
     def _publishers(self, topic: str) -> list:
         return self._node.get_publishers_info_by_topic(topic)

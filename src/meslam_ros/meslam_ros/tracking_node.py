@@ -234,7 +234,7 @@ class TrackingNode(ManagedNode):
         status.frames_tracked = session.tracked
         status.frames_dropped = dropped.total()
         status.frames_received = session.received + dropped.total()
-        status.drop_reasons = counts(dropped)
+        status.drop_reasons = counts(dropped + self._worker.input.lost)
         status.queue_length = self._worker.waiting
         status.paused = self._paused
         status.localising = session.localises
@@ -301,6 +301,7 @@ class TrackingNode(ManagedNode):
                 "state": result.state.name if result else "INITIALISING",
                 "frames_tracked": session.tracked,
                 "dropped": dropped or "none",
+                "lost": counts(worker.input.lost) or "none",
                 "queue_length": worker.waiting,
                 "keyframes": session.keyframes,
                 "regions": len(session.regions),

@@ -154,6 +154,7 @@ PYBIND11_MODULE(_kernel, module) {
              py::arg("encoding_scale") = 1.0f);
     bind_rays(module, field);
     bind_rgbd(module);
+    bind_observation(module);
 }
 
 }  // namespace meslam

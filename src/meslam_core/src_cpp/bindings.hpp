@@ -62,6 +62,9 @@ inline Array new_matrix(size_t rows, py::ssize_t columns) {
 // Adds the alignment of RGB-D images.
 void bind_rgbd(py::module_& module);
 
+// Adds the marking of what rays have seen.
+void bind_observation(py::module_& module);
+
 // Adds the training on rays and the alignment of frames.
 void bind_rays(py::module_& module, py::class_<FusedField>& field);
 

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 
+from meslam_core.regions import observed_mask
 from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED, ObservedMask
 
 TRUNCATION_M = 0.1
@@ -116,3 +117,29 @@ def test_a_keyframe_is_marked_in_real_time() -> None:
         mask.integrate(np.zeros(3), directions, distances, TRUNCATION_M)
         fastest = min(fastest, time.thread_time() - started)
     assert fastest < 0.030
+
+
+def test_the_compiled_kernel_marks_what_the_reference_marks(monkeypatch) -> None:
+    pytest.importorskip("meslam_core.field._kernel", reason="the compiled kernel is not built")
+    directions, distances = fan(4096, 3.5)
+    distances[::7] = 0.0
+    compiled, reference = ObservedMask(2.0, 0.08), ObservedMask(2.0, 0.08)
+    start = np.array([-0.7, 0.31, 0.123])
+    compiled.integrate(start, directions, distances, TRUNCATION_M)
+    monkeypatch.setattr(observed_mask, "_kernel", None)
+    reference.integrate(start, directions, distances, TRUNCATION_M)
+    # Points on a voxel's border may round to either side.
+    assert np.count_nonzero(compiled.flags) > 10000
+    assert np.count_nonzero(compiled.flags != reference.flags) < 10
+
+
+def test_the_kernel_refuses_what_does_not_fit() -> None:
+    kernel = pytest.importorskip("meslam_core.field._kernel")
+    ray = {"directions": np.zeros((1, 3), np.float32), "origin": np.zeros(3, np.float32)}
+    numbers = {"voxel_m": 0.1, "truncation_m": 0.1, "along": 1, "at_end": 3}
+    cube = np.zeros((4, 4, 4), np.uint8)
+    for flags, distance in ((cube[:3], 1.0), (cube.astype(np.float32), 1.0), (cube, 2e3)):
+        with pytest.raises(ValueError, match="expected|beyond"):
+            kernel.mark_rays(flags, distances=np.array([distance], np.float32), **ray, **numbers)
+    kernel.mark_rays(cube, distances=np.array([np.nan], np.float32), **ray, **numbers)
+    assert not cube.any()

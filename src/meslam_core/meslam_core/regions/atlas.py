@@ -27,7 +27,7 @@ PATIENCE = 1.6
 # Work that regions bring with them is spread over frames: keyframes read from disk, and views
 # marked in masks, at most so many a frame.
 READ_A_FRAME = 24
-MARKED_A_FRAME = 1
+MARKED_A_FRAME = 2
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+
+_kernel: Any = None
+try:
+    from meslam_core.field import _kernel
+except ImportError:
+    # The numpy implementation below marks the same voxels, more slowly.
+    pass
 
 OBSERVED = np.uint8(1)
 NEAR_SURFACE = np.uint8(2)
@@ -63,6 +72,18 @@ class ObservedMask:
             truncation_m: depth behind the surface that counts as seen [m].
         """
         if not len(distances_m):
+            return
+        if _kernel is not None:
+            _kernel.mark_rays(
+                self.flags,
+                np.ascontiguousarray(origin, np.float32),
+                np.ascontiguousarray(directions, np.float32),
+                np.ascontiguousarray(distances_m, np.float32),
+                voxel_m=self.voxel_m,
+                truncation_m=truncation_m,
+                along=OBSERVED,
+                at_end=OBSERVED | NEAR_SURFACE,
+            )
             return
         flat = self.flags.reshape(-1)
         # In the order of their length, the rays that reach a distance are the last ones.

@@ -8,9 +8,10 @@ from typing import Any
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from meslam_interfaces.msg import RegionArray, RegionModel, TrackingStatus
+from meslam_interfaces.msg import Region, RegionArray, RegionModel, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.conversions import NANOSECONDS, to_stamp
+from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, Diagnostics
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.markers import region_markers
 from meslam_ros.node_settings import MapFrameSettings, RegionManagerSettings
@@ -36,6 +37,7 @@ class RegionManagerNode(ManagedNode):
         self._config = read_config(self)
         self._regions = self.create_publisher(RegionArray, topics.REGIONS, latched())
         self._markers = self.create_publisher(MarkerArray, topics.REGION_MARKERS, latched())
+        self._diagnostics = Diagnostics(self)
 
     def activate(self) -> None:
         self._models = self.create_subscription(
@@ -46,13 +48,16 @@ class RegionManagerNode(ManagedNode):
         )
         self._changed = True
         self._timer = self.create_timer(self._settings.regions_period_s, self._tick, clock=STEADY)
+        self._diagnosis = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
 
     def deactivate(self) -> None:
-        self.destroy_timer(self._timer)
+        for timer in (self._timer, self._diagnosis):
+            self.destroy_timer(timer)
         self.destroy_subscription(self._models)
         self.destroy_subscription(self._status)
 
     def cleanup(self) -> None:
+        self._diagnostics.close()
         self.destroy_publisher(self._regions)
         self.destroy_publisher(self._markers)
         self._catalog.begin("")
@@ -94,6 +99,20 @@ class RegionManagerNode(ManagedNode):
         )
         self._markers.publish(
             MarkerArray(markers=region_markers(self._catalog.entries.values(), header))
+        )
+
+    def _diagnose(self) -> None:
+        entries = self._catalog.entries.values()
+        states = [entry.state for entry in entries]
+        self._diagnostics.report(
+            OK if entries else STALE,
+            f"{len(entries)} regions" if entries else "no region yet",
+            {
+                "regions": len(entries),
+                "training": states.count(Region.TRAINING),
+                "working": states.count(Region.WORKING),
+                "map_bytes": sum(entry.size for entry in entries),
+            },
         )
 
 

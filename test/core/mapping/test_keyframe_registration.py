@@ -28,8 +28,8 @@ class Arriving:
     def __init__(self, frames_wait: Callable[[], bool]) -> None:
         scratch = ScratchFile()
         self.keyframes = KeyframeStore(512, torch.device("cpu"), scratch=scratch)
-        atlas = RegionAtlas(CONFIG, path(1)[0][:3, 3], self.keyframes, 0, scratch)
-        self.registration = KeyframeRegistration(CONFIG, atlas, scratch, frames_wait)
+        self.atlas = RegionAtlas(CONFIG, path(1)[0][:3, 3], self.keyframes, 0, scratch)
+        self.registration = KeyframeRegistration(CONFIG, self.atlas, scratch, frames_wait)
         self._generator = np.random.default_rng(0)
 
     def add(self, count: int) -> None:
@@ -100,3 +100,26 @@ def test_only_so_many_keyframes_are_behind_with_their_registrations():
     newest = 3 * KEYFRAMES_BEHIND - 1
     assert arriving.linked.count(newest) == 3
     assert len(arriving.linked) < 3 * newest - 3
+
+
+def test_regions_in_doubt_are_asked_in_turn(monkeypatch):
+    arriving = Arriving(lambda: False)
+    registration = arriving.registration
+    spacing = arriving.atlas.grid.spacing_m
+    for steps in (0.45, 1.0, 1.45):
+        arriving.atlas.update(np.array([steps * spacing, 0.0, 0.0]))
+        arriving.atlas.settle()
+    doubtful = list(arriving.atlas.regions.values())
+    for region in doubtful:
+        region.confirmed = False
+    asked: list[tuple[int, int, int]] = []
+
+    def ask(region, number, camera, rays):
+        asked.append(region.index)
+        return iter(())
+
+    monkeypatch.setattr(registration.recogniser, "ask", ask)
+    arriving.add(4)
+    awake = [region.index for region in arriving.atlas.doubtful]
+    assert len(awake) == 2
+    assert asked == awake + awake

@@ -101,7 +101,9 @@ class KeyframeRegistration:
     ) -> Iterator[None]:
         """One registration after the other: where it is, and then what else it sees."""
         if self.recogniser is not None:
-            for region in self._atlas.doubtful[:1]:
+            # One after the other: the first may be where no older keyframe was.
+            doubtful = self._atlas.doubtful
+            for region in doubtful[number % max(len(doubtful), 1) :][:1]:
                 yield from self.recogniser.ask(region, number, camera, rays)
         for attempt, link in enumerate(linker.link(number, camera, rays), 1):
             if link is not None:

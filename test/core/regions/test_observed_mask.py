@@ -139,7 +139,7 @@ def test_the_kernel_refuses_what_does_not_fit() -> None:
     numbers = {"voxel_m": 0.1, "truncation_m": 0.1, "along": 1, "at_end": 3}
     cube = np.zeros((4, 4, 4), np.uint8)
     for flags, distance in ((cube[:3], 1.0), (cube.astype(np.float32), 1.0), (cube, 2e3)):
-        with pytest.raises(ValueError, match="expected|beyond"):
+        with pytest.raises(ValueError, match=r"expected|beyond"):
             kernel.mark_rays(flags, distances=np.array([distance], np.float32), **ray, **numbers)
     kernel.mark_rays(cube, distances=np.array([np.nan], np.float32), **ray, **numbers)
     assert not cube.any()

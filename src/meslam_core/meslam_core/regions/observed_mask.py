@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+# Without the kernel the numpy implementation marks the same voxels, more slowly.
 _kernel: Any = None
-try:
+with contextlib.suppress(ImportError):
     from meslam_core.field import _kernel
-except ImportError:
-    # The numpy implementation below marks the same voxels, more slowly.
-    pass
 
 OBSERVED = np.uint8(1)
 NEAR_SURFACE = np.uint8(2)

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from data.analytic_scene import GRID, SphereInRoom, learnt_field, stored
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
 
 from meslam_core.map.stored_region import StoredRegion
@@ -86,6 +88,22 @@ def test_regions_are_listed_with_their_states(start_node, client, regions) -> No
     assert first.bytes == len(model(regions[0]).data)
     assert first.observed_volume_m3 == pytest.approx(regions[0].mask.observed_volume_m3)
     assert array.regions[1].pose.position.x == pytest.approx(GRID.spacing_m)
+
+
+def test_a_changed_period_counts_at_once(start_node, client, regions) -> None:
+    node = start_node(RegionManagerNode, regions_period_s=60.0)
+    tracking = Tracking(client)
+    tracking.publish(model(replace(regions[0], version=1)))
+    assert client.spin_until(lambda: bool(states(client)), WAIT_S)
+    tracking.publish(model(replace(regions[0], version=2)))
+    client.spin_until(lambda: False, 1.0)
+    assert client.regions.regions[0].version == 1
+    request = SetParameters.Request(
+        parameters=[Parameter("regions_period_s", value=0.1).to_parameter_msg()]
+    )
+    answer = client.call(SetParameters, f"/{node.get_name()}/set_parameters", request)
+    assert answer.results[0].successful
+    assert client.spin_until(lambda: client.regions.regions[0].version == 2, WAIT_S)
 
 
 def test_markers_show_boxes_labels_and_the_intersection(start_node, client, regions) -> None:

@@ -9,6 +9,7 @@ from data.textured_room import PERIOD_NS, frame_at
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy, qos_profile_sensor_data
 from std_srvs.srv import SetBool, Trigger
@@ -244,6 +245,26 @@ def test_tracking_goes_on_without_odometry_and_without_a_base(start_node, client
     # The optical frame is the base, and looks along the map's x axis at first.
     first = client.poses[min(client.poses)]
     np.testing.assert_allclose(first, T_BODY_OPTICAL, atol=1e-6)
+
+
+def test_a_shorter_queue_counts_at_once_and_says_what_it_dropped(start_node, client) -> None:
+    node = start_node(TrackingNode, **FAST | {"mapping__iterations": 300, "give_way": False})
+    camera = Camera(client)
+    camera.wait()
+    camera.track(0)
+    (result,) = node.set_parameters([Parameter("queue_size", value=1)])
+    assert result.successful
+    for number in range(1, 8):
+        camera.send(number)
+
+    def accounted() -> bool:
+        return client.statuses[-1].frames_received == 8
+
+    assert client.spin_until(accounted, ANSWER_S)
+    last = client.statuses[-1]
+    assert last.frames_dropped > 0
+    assert last.frames_tracked == 8 - last.frames_dropped
+    assert f"queue full: {last.frames_dropped}" in last.drop_reasons
 
 
 def test_reset_and_pause(start_node, client) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any
 
+from rclpy.parameter import Parameter
+from rclpy.timer import Timer
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from meslam_interfaces.msg import Region, RegionArray, RegionModel, TrackingStatus
 from meslam_ros import topics
-from meslam_ros.conversions import NANOSECONDS, to_stamp
+from meslam_ros.conversions import to_stamp
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, Diagnostics
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.markers import region_markers
@@ -32,6 +35,8 @@ class RegionManagerNode(ManagedNode):
         self._catalog = RegionCatalog()
         self._live_map_id = ""
         self._changed = False
+        self._timer: Timer | None = None
+        self.add_post_set_parameters_callback(self._retime)
 
     def configure(self) -> None:
         self._config = read_config(self)
@@ -47,12 +52,23 @@ class RegionManagerNode(ManagedNode):
             TrackingStatus, topics.STATUS, self._take_status, STREAM
         )
         self._changed = True
-        self._timer = self.create_timer(self._settings.regions_period_s, self._tick, clock=STEADY)
+        self._timer = self._ticking()
         self._diagnosis = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
+
+    def _ticking(self) -> Timer:
+        period_s = self.get_parameter("regions_period_s").value
+        return self.create_timer(float(period_s), self._tick, clock=STEADY)
+
+    def _retime(self, changed: Sequence[Parameter]) -> None:
+        """Follow a changed period at once; a timer alone would first end the old one."""
+        if self._timer is not None and any(p.name == "regions_period_s" for p in changed):
+            self.destroy_timer(self._timer)
+            self._timer = self._ticking()
 
     def deactivate(self) -> None:
         for timer in (self._timer, self._diagnosis):
             self.destroy_timer(timer)
+        self._timer = None
         self.destroy_subscription(self._models)
         self.destroy_subscription(self._status)
 
@@ -83,9 +99,6 @@ class RegionManagerNode(ManagedNode):
             self._publish()
 
     def _tick(self) -> None:
-        period_ns = round(self._settings.regions_period_s * NANOSECONDS)
-        if self._timer.timer_period_ns != period_ns:
-            self._timer.timer_period_ns = period_ns
         if self._changed:
             self._publish()
 

@@ -148,12 +148,17 @@ def _revisits(summary: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]
                 names[method],
                 str(tuple(visit["region"])),
                 str(visit["others"]),
-                *(
-                    "-" if visit[key] is None else _centimetres(visit[key])
-                    for key in ("left_m", "return_m", "left_again_m")
-                ),
+                _centimetres(visit["left_m"]),
+                *(_changed(visit[key], visit["left_m"]) for key in ("return_m", "left_again_m")),
             )
     return table
+
+
+def _changed(error_m: float | None, before_m: float) -> str:
+    """An error with how much larger it is than before."""
+    if error_m is None:
+        return "-"
+    return f"{_centimetres(error_m)} ({error_m / before_m - 1.0:+.0%})"
 
 
 def _centimetres(metres: float) -> str:

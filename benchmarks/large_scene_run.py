@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from meslam_core.config import MeslamConfig
 from meslam_core.evaluation.reconstruction import sample
-from meslam_core.evaluation.region_error import RegionError, RegionVisits, region_error
+from meslam_core.evaluation.region_error import RegionError, RegionVisits, error_at, in_box
 from meslam_core.loop.pose_graph import rigid_motion
 from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.map.stored_region import snapshot
@@ -34,7 +34,6 @@ from meslam_core.odometry import make_odometry
 from meslam_core.odometry_worker import OdometryWorker
 from meslam_core.recordings.registry import open_recording
 from meslam_core.regions.grid import RegionIndex
-from meslam_core.regions.observed_mask import OBSERVED
 from meslam_core.results import MAP, ONLINE_TRAJECTORY, TRAJECTORY, ResultFolder
 from meslam_core.run_report import Tally, map_entries, run_environment
 from meslam_core.session_map import write_map
@@ -99,12 +98,10 @@ class RegionSurface:
         if index not in self._known:
             # What came later may have been registered differently.
             keyframes = list(region.keyframes)
-            local = placed.to_local(self._in_map(keyframes, self._surface))
-            inside = np.flatnonzero((np.abs(local) < region.half_side_m).all(axis=1))
-            inside = inside[placed.lookup(local[inside]) & OBSERVED > 0]
-            self._known[index] = keyframes, self._surface[inside]
+            seen = in_box(placed, self._in_map(keyframes, self._surface))
+            self._known[index] = keyframes, self._surface[seen]
         keyframes, points = self._known[index]
-        return region_error(placed, self._in_map(keyframes, points), observed_only=False)
+        return error_at(placed, self._in_map(keyframes, points))
 
     def _in_map(self, keyframes: list[int], points: NDArray[np.floating]) -> NDArray[np.float64]:
         store = self._slam.keyframes

@@ -8,6 +8,7 @@ from typing import Any
 
 import large_scene
 import large_scene_errors
+import large_scene_figures
 import numpy as np
 import pytest
 from large_scene_figures import tables, widest
@@ -135,3 +136,24 @@ def test_one_network_has_no_seams_and_still_its_rows():
     }
     found = tables({"imap_star": figures}, {"imap_star": "iMAP*"})
     assert [table.row_count for table in found] == [1, 1, 0]
+
+
+def test_what_became_of_an_error_is_told_as_a_share_too():
+    assert large_scene_figures._changed(0.011, 0.010) == "1.10 (+10%)"
+    assert large_scene_figures._changed(None, 0.010) == "-"
+
+
+def test_a_quick_run_needs_no_more_of_the_building_than_it_shows(monkeypatch, tmp_path):
+    made = []
+
+    def simulated(scene, path, *options):
+        made.append((scene, path.name, *options))
+        return path
+
+    monkeypatch.setattr(large_scene, "simulated", simulated)
+    for arguments in (["--quick"], [], ["--quick", "--recording", str(tmp_path / "b.mcap")]):
+        large_scene.chosen_recording(large_scene.parsed_options(arguments))
+    assert made == [
+        ("building", "building_quick.mcap", "--duration", "4.0"),
+        ("building", "building.mcap"),
+    ]

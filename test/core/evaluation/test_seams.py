@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from data.analytic_scene import GRID, SphereInRoom, learnt_field, stored
 
-from meslam_core.evaluation.region_error import RegionError, RegionVisits, region_error
+from meslam_core.evaluation.region_error import (
+    RegionError,
+    RegionVisits,
+    error_at,
+    in_box,
+    region_error,
+)
 from meslam_core.evaluation.seams import seam_jumps
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.placed_region import PlacedRegion
@@ -75,6 +81,17 @@ def test_what_a_region_never_saw_does_not_count(regions):
     )
     assert error.points == 0
     assert np.isnan(error.median_m)
+
+
+def test_the_same_points_count_wherever_a_region_was_moved_to(regions):
+    region, points = PlacedRegion(regions[0], "auto"), wall_points()
+    seen = points[in_box(region, points)]
+    assert 2000 < len(seen) <= len(points)
+    assert not in_box(region, points + 5.0).any()
+    assert in_box(region, points, observed_only=False).all()
+    moved = error_at(PlacedRegion(shifted(regions[0]), "auto"), seen)
+    assert moved.points == len(seen)
+    assert error_at(region, seen).mean_m < moved.mean_m
 
 
 def test_visits_tell_how_a_map_was_left_and_found_again():

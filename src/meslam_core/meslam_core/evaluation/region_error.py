@@ -19,7 +19,7 @@ class RegionError:
     """Distance of the true surface in a region's box to the region's own surface.
 
     Attributes:
-        points: of the true surface in the box that the region has observed.
+        points: of the true surface that count.
         median_m, mean_m: of their distances, each at most the truncation [m]; NaN without points.
     """
 
@@ -35,25 +35,43 @@ class RegionError:
 def region_error(
     region: PlacedRegion, surface: NDArray[np.floating], observed_only: bool = True
 ) -> RegionError:
-    """A region's error, whatever other regions say of the same place.
+    """A region's error in its box, whatever other regions say of the same place.
 
     Args:
         region: ready to answer.
         surface: (N, 3) points of the true surface, map frame [m].
         observed_only: leave out what the region has not observed.
     """
+    return error_at(region, surface[in_box(region, surface, observed_only)])
+
+
+def in_box(
+    region: PlacedRegion, surface: NDArray[np.floating], observed_only: bool = True
+) -> NDArray[np.bool_]:
+    """Which points (N,) of a surface (N, 3), map frame [m], lie in a region's box.
+
+    Args:
+        region: ready to answer.
+        surface: as above.
+        observed_only: leave out what the region has not observed.
+    """
     local = region.to_local(surface)
-    local = local[(np.abs(local) < region.stored.half_side_m).all(axis=1)]
+    inside = np.asarray((np.abs(local) < region.stored.half_side_m).all(axis=1))
     if observed_only:
-        local = local[region.lookup(local) & OBSERVED > 0]
-    if not len(local):
+        inside[inside] = region.lookup(local[inside]) & OBSERVED > 0
+    return inside
+
+
+def error_at(region: PlacedRegion, surface: NDArray[np.floating]) -> RegionError:
+    """A region's error at all given points (N, 3) of the true surface, map frame [m]."""
+    if not len(surface):
         return RegionError(0, float("nan"), float("nan"))
     architecture = region.stored.architecture
-    values, gradient = region.gradient(local)
+    values, gradient = region.gradient(region.to_local(surface))
     slope = np.maximum(np.linalg.norm(gradient, axis=1), 1.0 / architecture.truncation_m / 8.0)
     off = np.abs(values[:, 0] - surface_level(architecture.field_config())) / slope
     off = np.minimum(off, architecture.truncation_m)
-    return RegionError(len(local), float(np.median(off)), float(off.mean()))
+    return RegionError(len(surface), float(np.median(off)), float(off.mean()))
 
 
 @dataclass

@@ -15,8 +15,7 @@ from visualization_msgs.msg import Marker
 
 from meslam_core.errors import MapError
 from meslam_core.map.mesh import extract_mesh
-from meslam_core.map.occupancy import occupancy_grid
-from meslam_core.map.surface import surface_points
+from meslam_core.map.occupancy import OccupancyLayer
 from meslam_core.regions.grid import RegionIndex
 from meslam_ros import topics
 from meslam_ros.conversions import to_stamp
@@ -59,6 +58,7 @@ class MapTopics:
         self._published: dict[str, object] = {}
         self._mesh_versions: dict[RegionIndex, tuple[int, float]] = {}
         self._map_id = ""
+        self._layer: tuple[tuple[float, float, float], OccupancyLayer] | None = None
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="map topics", daemon=True)
         self._thread.start()
@@ -94,17 +94,23 @@ class MapTopics:
         if self._clear in wanted:
             self._renew_meshes(snapshot, header)
         if self._points in wanted and self._due("points", snapshot):
-            points = surface_points(snapshot.map, self._settings.points_topic_spacing_m)
+            points = snapshot.surfaces.points(self._settings.points_topic_spacing_m)
             self._points.publish(point_cloud(points, header))
         if self._grid in wanted and self._due("grid", snapshot):
-            settings = self._settings
-            grid = occupancy_grid(
-                snapshot.map,
-                settings.grid_min_height_m,
-                settings.grid_max_height_m,
-                settings.grid_resolution_m,
-            )
+            grid = self._current_layer().update(snapshot.map)
             self._grid.publish(grid_message(grid, header))
+
+    def _current_layer(self) -> OccupancyLayer:
+        """The grid's layer; another one when its parameters have changed."""
+        settings = self._settings
+        numbers = (
+            settings.grid_min_height_m,
+            settings.grid_max_height_m,
+            settings.grid_resolution_m,
+        )
+        if self._layer is None or self._layer[0] != numbers:
+            self._layer = numbers, OccupancyLayer(*numbers)
+        return self._layer[1]
 
     def _begin(self, snapshot: MapSnapshot) -> None:
         """Another map: viewers forget the meshes of the one before."""
@@ -114,6 +120,7 @@ class MapTopics:
         self._meshes.clear()
         self._mesh_versions.clear()
         self._published.clear()
+        self._layer = None
         header = Header(stamp=to_stamp(snapshot.stamp_ns), frame_id=self._map_frame)
         self._clear.publish(delete_all(header))
 

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from meslam_core.errors import MapError
 from meslam_core.map.neural_map import FREE, OCCUPIED, UNKNOWN, NeuralMap
-from meslam_core.map.occupancy import OccupancyGrid, occupancy_grid
+from meslam_core.map.occupancy import OccupancyGrid, OccupancyLayer, occupancy_grid
+from meslam_core.map.stored_region import StoredRegion
 
 
 def at(grid: OccupancyGrid, x: float, y: float) -> int:
@@ -50,6 +53,21 @@ def test_rows_are_y_and_columns_are_x(neural_map: NeuralMap) -> None:
 def test_beyond_the_map_nothing_is_known(neural_map: NeuralMap) -> None:
     box = (np.array([5.0, 5.0]), np.array([6.0, 6.0]))
     assert (occupancy_grid(neural_map, 0.0, 1.0, 0.1, box=box).cells == UNKNOWN).all()
+
+
+def test_a_layer_follows_a_map_that_grows_and_moves(
+    region: StoredRegion, neighbour: StoredRegion
+) -> None:
+    T_map_moved = neighbour.T_map_region.copy()
+    T_map_moved[:2, 3] += [0.6, -0.35]
+    moved = replace(neighbour, T_map_region=T_map_moved, version=neighbour.version + 1)
+    layer = OccupancyLayer(-0.3, 0.3, 0.05)
+    for regions in ([region], [region, neighbour], [region, moved], [moved], [region]):
+        neural_map = NeuralMap(regions)
+        grid, anew = layer.update(neural_map), occupancy_grid(neural_map, -0.3, 0.3, 0.05)
+        np.testing.assert_array_equal(grid.cells, anew.cells)
+        np.testing.assert_allclose(grid.origin, anew.origin)
+    assert layer.update(NeuralMap([region])) is grid
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def extract_mesh(
         neural_map: to ask.
         resolution_m: edge of a marching cube [m]; by default the map configuration's.
         box: lowest and highest corner (3,) of the part wanted, map frame [m].
-        regions: only what these regions saw near a surface; others still blend in.
+        regions: only what they saw in their boxes, and outside of all boxes; others blend in.
         min_shard_m2: disconnected pieces with less surface are dropped [m^2].
         progress: called with the number of tiles done and their total.
 
@@ -62,7 +62,7 @@ def extract_mesh(
     if box is not None and not (np.asarray(box[0]) < np.asarray(box[1])).all():
         raise MapError(f"the box from {box[0]} to {box[1]} is empty; give its lowest corner first")
     chosen = neural_map.regions if regions is None else neural_map.subset(regions)
-    tiles = _tiles(_near_blocks(chosen, resolution, box))
+    tiles = _tiles(_near_blocks(neural_map, chosen, resolution, box))
     builder = _Builder(neural_map, chosen, resolution)
     for number, (tile, blocks) in enumerate(sorted(tiles.items())):
         builder.add(tile, blocks)
@@ -88,16 +88,19 @@ def _seen_from_front(mesh: TriangleMesh, neural_map: NeuralMap) -> TriangleMesh:
 
 
 def _near_blocks(
-    regions: Iterable[PlacedRegion],
+    neural_map: NeuralMap,
+    regions: list[PlacedRegion],
     resolution: float,
     box: tuple[NDArray[np.floating], NDArray[np.floating]] | None,
 ) -> NDArray[np.int64]:
-    """Blocks (N, 3) of BLOCK cubes a side that may hold a surface some region saw near it."""
+    """Blocks (N, 3) of BLOCK cubes a side that may hold a surface that a region tells of."""
     side = BLOCK * resolution
     found = [np.zeros((0, 3), np.int64)]
     for region in regions:
         mask = region.stored.mask
         centers = region.observed_centers(near_surface=True)
+        if len(regions) < len(neural_map.regions):
+            centers = centers[neural_map.assigned(region, centers, mask.voxel_m)]
         if not len(centers):
             continue
         reach = 0.5 * mask.voxel_m * np.abs(region.rotation).sum(axis=1) + resolution
@@ -204,12 +207,13 @@ class _Builder:
         return crossed
 
     def _near(self, points: NDArray[np.floating], flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Which points (N, 3) a chosen region saw near a surface; `flags` are any region's."""
+        """Which points (N, 3) are near a surface, for a chosen region; `flags` are any region's."""
         if self._all:
             return flags & NEAR_SURFACE > 0
         near = np.zeros(len(points), bool)
         for region in self._chosen:
-            near |= region.lookup(region.to_local(points)) & NEAR_SURFACE > 0
+            seen = np.flatnonzero(region.lookup(region.to_local(points)) & NEAR_SURFACE)
+            near[seen] |= self._map.assigned(region, points[seen])
         return near
 
     def _march(

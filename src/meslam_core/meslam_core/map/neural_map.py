@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,6 +126,31 @@ class NeuralMap:
     def touching(self, low: Points, high: Points) -> list[PlacedRegion]:
         """The regions that may have observed something between two corners (3,) [m]."""
         return [region for region in self.regions if region.touches(low, high)]
+
+    def only(self, region: PlacedRegion) -> NeuralMap:
+        """One of the regions as a map of its own, without the others' part in the blend."""
+        single = copy.copy(self)
+        single.regions = [region]
+        return single
+
+    def assigned(
+        self, region: PlacedRegion, points: Points, margin_m: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Which points (N, 3) are a region's when every region tells its own part of the map.
+
+        Those in its box or so near to it [m], and those in no box at all.
+        """
+        own = region.in_box(points, margin_m)
+        rest = np.flatnonzero(~own)
+        if len(rest):
+            outside = points[rest]
+            low, high = outside.min(axis=0), outside.max(axis=0)
+            free = np.ones(len(rest), bool)
+            for other in self.regions:
+                if other is not region and other.box_touches(low, high):
+                    free &= ~other.in_box(outside)
+            own[rest] = free
+        return own
 
     def flags(self, points: Points) -> NDArray[np.uint8]:
         """What any region observed (N,): OBSERVED and NEAR_SURFACE of the mask."""

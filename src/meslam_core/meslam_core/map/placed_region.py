@@ -37,10 +37,17 @@ class PlacedRegion:
         """Whether anything observed may lie in a box of the map frame."""
         return bool((self.bounds[0] <= high).all() and (self.bounds[1] >= low).all())
 
-    def in_box(self, points: Points) -> NDArray[np.bool_]:
-        """Which points (N, 3) of the map frame lie in the region's box."""
-        local = np.abs(self.to_local(points))
-        return np.asarray(local.max(axis=1, initial=0.0) <= self.stored.half_side_m, np.bool_)
+    def in_box(self, points: Points, margin_m: float = 0.0) -> NDArray[np.bool_]:
+        """Which points (N, 3) of the map frame lie in the region's box, or so near to it."""
+        inside = np.ones(len(points), bool)
+        for column in self.to_local(points).T:
+            inside &= np.abs(column) <= self.stored.half_side_m + margin_m
+        return inside
+
+    def box_touches(self, low: Points, high: Points) -> bool:
+        """Whether the region's box may reach into a box of the map frame."""
+        reach = self.stored.half_side_m * np.abs(self.rotation).sum(axis=1)
+        return bool((self.center - reach <= high).all() and (self.center + reach >= low).all())
 
     def observed_centers(self, near_surface: bool = False) -> NDArray[np.float64]:
         """Centres (N, 3) of the voxels observed, or of those near a surface, map frame [m]."""

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 
 from meslam_core import se3
-from meslam_core.slam import FrameResult
+from meslam_core.frame_result import FrameResult, TrackingState
 from meslam_core.trajectory import Trajectory
 from meslam_interfaces.msg import TrackingStatus
 from meslam_ros.conversions import to_pose, to_poses, to_stamp
+from meslam_ros.diagnostics import ERROR, OK, STALE, WARN
+
+LEVELS = {TrackingState.OK: OK, TrackingState.LOST: ERROR}
 
 
 def header(stamp_ns: int, frame_id: str) -> Header:
@@ -58,6 +61,21 @@ def path_message(trajectory: Trajectory, T_camera_base: se3.Pose, frame_id: str)
     if path.poses:
         path.header = path.poses[-1].header
     return path
+
+
+def health(result: FrameResult | None, dropped: str) -> tuple[bytes, str]:
+    """Level and sentence for /diagnostics.
+
+    Args:
+        result: of the latest frame; None before the first.
+        dropped: images that were not used, with counts; empty when there were none.
+    """
+    if result is None:
+        return (ERROR, f"images were not used: {dropped}") if dropped else (STALE, "no images yet")
+    level = LEVELS.get(result.state, WARN)
+    if dropped and level == OK:
+        return WARN, f"images were not used: {dropped}"
+    return level, result.reason or result.state.name
 
 
 def status_message(result: FrameResult, head: Header) -> TrackingStatus:

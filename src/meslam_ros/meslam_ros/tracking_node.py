@@ -7,7 +7,6 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import Path
 from std_srvs.srv import SetBool, Trigger
 
 from meslam_core import se3
@@ -19,7 +18,7 @@ from meslam_core.threads import limit_threads
 from meslam_interfaces.msg import RegionIndex, TrackingStatus
 from meslam_interfaces.srv import UseMap
 from meslam_ros import topics
-from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, STALE, WARN, Diagnostics, counts
+from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, Diagnostics, counts
 from meslam_ros.frame_worker import FrameWorker
 from meslam_ros.given_map import GivenMap, Preparation
 from meslam_ros.image_synchronizer import ImagePair
@@ -30,21 +29,19 @@ from meslam_ros.model_publisher import ModelPublisher
 from meslam_ros.node_settings import FrameSettings, InputSettings, TrackingSettings
 from meslam_ros.odometry_source import OdometrySource
 from meslam_ros.parameters import declare_config, declare_settings, read_config
-from meslam_ros.qos import STREAM, latched
+from meslam_ros.path_publisher import PathPublisher
+from meslam_ros.qos import STREAM
 from meslam_ros.rgbd_input import STEADY
 from meslam_ros.tracking_messages import (
     covariance_message,
     header,
-    path_message,
+    health,
     pose_message,
     status_message,
 )
 from meslam_ros.transforms import CameraMount
 
-# Building a path takes a time that grows with its length; it may take this share of all time.
-PATH_SHARE = 0.03
 FLUSHING_S = 10.0
-LEVELS = {TrackingState.OK: OK, TrackingState.LOST: ERROR}
 
 
 class TrackingNode(ManagedNode):
@@ -65,7 +62,7 @@ class TrackingNode(ManagedNode):
         self._covariance = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSE_WITH_COVARIANCE, STREAM
         )
-        self._path = self.create_publisher(Path, topics.PATH, latched())
+        self._path = PathPublisher(self, frames.map_frame, lambda: settings.path_period_s)
         self._status = self.create_publisher(TrackingStatus, topics.STATUS, STREAM)
         self._diagnostics = Diagnostics(self)
         self._models = ModelPublisher(
@@ -105,9 +102,10 @@ class TrackingNode(ManagedNode):
         self._map_to_odom.close()
         self._diagnostics.close()
         self._odometry.close()
+        self._path.close()
         for service in (self._reset, self._pause, self._use):
             self.destroy_service(service)
-        for publisher in (self._pose, self._covariance, self._path, self._status):
+        for publisher in (self._pose, self._covariance, self._status):
             self.destroy_publisher(publisher)
 
     def _begin(self, session: MappingSession | None = None) -> None:
@@ -115,7 +113,7 @@ class TrackingNode(ManagedNode):
         self._session = session or self._make_session()
         self._reset_requested = False
         self._all_published = True
-        self._path_due_s = 0.0
+        self._path.begin()
         self._models.begin(self._session.map_id)
         self._map_to_odom.reset()
 
@@ -172,8 +170,7 @@ class TrackingNode(ManagedNode):
         head = header(frame.stamp_ns, self._frames.map_frame)
         self._publish_status(status_message(session.map(), head), latency_s)
         self._all_published = False
-        if time.monotonic() >= self._path_due_s and self._path.get_subscription_count():
-            self._publish_path()
+        self._path.offer(session)
         if session.wants_new_map:
             self.restart("the camera has been lost for too long")
 
@@ -201,7 +198,7 @@ class TrackingNode(ManagedNode):
         self._all_published = True
         self._session.wait()
         self._models.offer(self._session.regions, self._session.mapped_ns, final=True)
-        self._publish_path()
+        self._path.publish(self._session)
         if not self._models.flush(FLUSHING_S):
             self.get_logger().warn("the last region models are still being encoded")
         self._latest_status.settled = True
@@ -241,15 +238,6 @@ class TrackingNode(ManagedNode):
         self._latest_status = status
         self._status.publish(status)
 
-    def _publish_path(self) -> None:
-        started = time.monotonic()
-        path = path_message(
-            self._session.trajectory(), self._session.T_camera_base, self._frames.map_frame
-        )
-        self._path.publish(path)
-        ended = time.monotonic()
-        self._path_due_s = ended + max(self._settings.path_period_s, (ended - started) / PATH_SHARE)
-
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._reset_requested = True
         self._given = None
@@ -287,16 +275,8 @@ class TrackingNode(ManagedNode):
     def _diagnose(self) -> None:
         session, worker = self._session, self._worker
         result, dropped = session.result, counts(worker.dropped + session.discarded)
-        level, message = STALE, "no images yet"
-        if result is not None:
-            level = LEVELS.get(result.state, WARN)
-            message = result.reason or result.state.name
-        if dropped and level in (OK, STALE):
-            level = WARN if result else ERROR
-            message = f"images were not used: {dropped}"
         self._diagnostics.report(
-            level,
-            message,
+            *health(result, dropped),
             {
                 "state": result.state.name if result else "INITIALISING",
                 "frames_tracked": session.tracked,

@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,6 +52,16 @@ def recording(tmp_path: Path) -> str:
     return str(path)
 
 
+@pytest.fixture
+def start_player(start_node) -> Callable[..., BagPlayerNode]:
+    """Starts a player with one who listens to it."""
+    return lambda **parameters: start_node(BagPlayerNode, **{"subscribers": 1, **parameters})
+
+
+def player_arguments(parameters: Mapping[str, Any]) -> list[str]:
+    return ros_arguments({"subscribers": 1, **parameters})
+
+
 class Viewer:
     """Subscribes to everything that the player sends."""
 
@@ -71,9 +83,9 @@ class Viewer:
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_what_was_recorded_is_what_is_seen(start_node, client, recording, encoding) -> None:
+def test_what_was_recorded_is_what_is_seen(start_player, client, recording, encoding) -> None:
     viewer = Viewer(client)
-    player = start_node(BagPlayerNode, recording=recording, rate=10.0, depth_encoding=encoding)
+    player = start_player(recording=recording, rate=10.0, depth_encoding=encoding)
     ended: list[bool] = []
     player.stop = lambda: ended.append(True)
     assert client.spin_until(lambda: viewer.counts == (COUNT,) * 3, WAIT_S)
@@ -98,7 +110,7 @@ def test_what_was_recorded_is_what_is_seen(start_node, client, recording, encodi
     np.testing.assert_allclose(mount, T_BODY_OPTICAL, atol=1e-12)
 
 
-def test_rate_keeps_the_recordings_pace(start_node, client, recording) -> None:
+def test_rate_keeps_the_recordings_pace(start_player, client, recording) -> None:
     viewer = Viewer(client)
     arrivals: list[float] = []
     clock = client.node.get_clock()
@@ -108,17 +120,16 @@ def test_rate_keeps_the_recordings_pace(start_node, client, recording) -> None:
         lambda _: arrivals.append(clock.now().nanoseconds),
         images(ReliabilityPolicy.RELIABLE),
     )
-    start_node(BagPlayerNode, recording=recording, rate=0.5)
+    start_player(recording=recording, rate=0.5)
     assert client.spin_until(lambda: len(arrivals) == COUNT, WAIT_S)
     expected = (COUNT - 1) * PERIOD_NS / 0.5
     assert arrivals[-1] - arrivals[0] == pytest.approx(expected, rel=0.25)
     assert viewer.counts[2] == COUNT
 
 
-def test_start_step_and_number_choose_frames(start_node, client, recording) -> None:
+def test_start_step_and_number_choose_frames(start_player, client, recording) -> None:
     viewer = Viewer(client)
-    start_node(
-        BagPlayerNode,
+    start_player(
         recording=recording,
         rate=10.0,
         start=2.1 * PERIOD_NS / NANOSECONDS,
@@ -133,15 +144,15 @@ def test_start_step_and_number_choose_frames(start_node, client, recording) -> N
     ]
 
 
-def test_first_image_waits_for_the_subscribers(start_node, client, recording) -> None:
-    start_node(BagPlayerNode, recording=recording, rate=10.0)
+def test_first_image_waits_for_the_subscribers(start_player, client, recording) -> None:
+    start_player(recording=recording, rate=10.0)
     client.spin_until(lambda: False, 1.0)
     viewer = Viewer(client)
     assert client.spin_until(lambda: viewer.counts == (COUNT,) * 3, WAIT_S)
 
 
-def test_missing_subscribers_are_named(start_node, client, recording, capfd) -> None:
-    player = start_node(BagPlayerNode, recording=recording, wait_timeout_s=0.5)
+def test_missing_subscribers_are_named(start_player, client, recording, capfd) -> None:
+    player = start_player(recording=recording, wait_timeout_s=0.5)
     assert client.spin_until(lambda: player.exit_code == 2, WAIT_S)
     client.spin_until(lambda: False, 0.2)
     log = capfd.readouterr().err
@@ -149,10 +160,10 @@ def test_missing_subscribers_are_named(start_node, client, recording, capfd) -> 
     assert "subscribers" in log
 
 
-def test_lockstep_sends_no_more_than_was_answered(start_node, client, recording) -> None:
+def test_lockstep_sends_no_more_than_was_answered(start_player, client, recording) -> None:
     viewer = Viewer(client)
     answers = client.node.create_publisher(TrackingStatus, topics.STATUS, STREAM)
-    player = start_node(BagPlayerNode, recording=recording, rate=0.0, window=2)
+    player = start_player(recording=recording, rate=0.0, window=2)
     for number in range(COUNT):
         expected = min(number + 2, COUNT)
         assert client.spin_until(lambda n=expected: len(viewer.color) == n, WAIT_S)
@@ -165,18 +176,18 @@ def test_lockstep_sends_no_more_than_was_answered(start_node, client, recording)
 
 
 def test_lockstep_without_tracking_gives_up_with_the_reason(
-    start_node, client, recording, capfd
+    start_player, client, recording, capfd
 ) -> None:
     Viewer(client)
-    player = start_node(BagPlayerNode, recording=recording, rate=0.0, wait_timeout_s=5.0)
+    player = start_player(recording=recording, rate=0.0, wait_timeout_s=5.0)
     assert client.spin_until(lambda: player.exit_code == 2, WAIT_S)
     client.spin_until(lambda: False, 0.2)
     assert "is the tracking node running" in capfd.readouterr().err
 
 
-def test_pause_and_loop(start_node, client, recording) -> None:
+def test_pause_and_loop(start_player, client, recording) -> None:
     viewer = Viewer(client)
-    start_node(BagPlayerNode, recording=recording, rate=2.0, loop=True)
+    start_player(recording=recording, rate=2.0, loop=True)
     assert client.spin_until(lambda: len(viewer.color) > COUNT, WAIT_S)
     assert client.call(SetBool, "/bag_player_node/pause", SetBool.Request(data=True)).success
     client.spin_until(lambda: False, 0.3)
@@ -189,10 +200,10 @@ def test_pause_and_loop(start_node, client, recording) -> None:
 
 
 def test_clock_goes_on_between_the_images_and_rests_in_a_pause(
-    start_node, client, recording
+    start_player, client, recording
 ) -> None:
     viewer = Viewer(client)
-    start_node(BagPlayerNode, recording=recording, rate=0.1)
+    start_player(recording=recording, rate=0.1)
     assert client.spin_until(lambda: len(viewer.color) >= 2, WAIT_S)
     ticks = [stamp_ns(clock.clock) for clock in viewer.clock]
     steps = np.diff(ticks)
@@ -206,9 +217,9 @@ def test_clock_goes_on_between_the_images_and_rests_in_a_pause(
     assert len(viewer.clock) == count
 
 
-def test_rate_can_change_while_it_plays(start_node, client, recording) -> None:
+def test_rate_can_change_while_it_plays(start_player, client, recording) -> None:
     viewer = Viewer(client)
-    player = start_node(BagPlayerNode, recording=recording, rate=0.05)
+    player = start_player(recording=recording, rate=0.05)
     assert client.spin_until(lambda: len(viewer.color) >= 1, WAIT_S)
     started = time.monotonic()
     [result] = player.set_parameters([Parameter("rate", value=50.0)])
@@ -219,12 +230,12 @@ def test_rate_can_change_while_it_plays(start_node, client, recording) -> None:
     assert not refused.successful
 
 
-def test_progress_is_shown(start_node, client, tmp_path, capfd, monkeypatch) -> None:
+def test_progress_is_shown(start_player, client, tmp_path, capfd, monkeypatch) -> None:
     monkeypatch.setattr(bag_player_node, "PROGRESS_S", 0.2)
     path = tmp_path / "plane.mcap"
     convert(MemoryRecording(FRAMES), path)
     Viewer(client)
-    player = start_node(BagPlayerNode, recording=str(path), rate=0.5)
+    player = start_player(recording=str(path), rate=0.5)
     ended: list[bool] = []
     player.stop = lambda: ended.append(True)
     assert client.spin_until(lambda: bool(ended), WAIT_S)
@@ -243,7 +254,7 @@ def test_playback_holds_for_a_subscriber_that_hangs(client, tmp_path) -> None:
     )
     player = NodeProcess(
         "bag_player_node",
-        ros_arguments({"recording": path, "rate": 5.0}),
+        player_arguments({"recording": path, "rate": 5.0}),
         log=tmp_path / "player.log",
     )
     try:
@@ -291,9 +302,9 @@ def real_bag(name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", ["d435_sdk2.55.bag", "d435_sdk2.59.db3"])
-def test_librealsense_recordings_play(start_node, client, name) -> None:
+def test_librealsense_recordings_play(start_player, client, name) -> None:
     viewer = Viewer(client)
-    start_node(BagPlayerNode, recording=str(real_bag(name)), rate=5.0, frames=3)
+    start_player(recording=str(real_bag(name)), rate=5.0, frames=3)
     assert client.spin_until(lambda: viewer.counts == (3,) * 3, WAIT_S)
     assert (depth_image(viewer.depth[0], "depth") > 0).mean() > 0.5
 
@@ -315,9 +326,9 @@ FORMATS = {
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_plays(start_node, client, tmp_path, name) -> None:
+def test_every_format_plays(start_player, client, tmp_path, name) -> None:
     viewer = Viewer(client)
-    start_node(BagPlayerNode, recording=str(FORMATS[name](tmp_path)), rate=10.0)
+    start_player(recording=str(FORMATS[name](tmp_path)), rate=10.0)
     assert client.spin_until(lambda: viewer.counts == (COUNT,) * 3, WAIT_S)
     for frame, color, depth in zip(FRAMES, viewer.color, viewer.depth, strict=True):
         assert stamp_ns(color.header.stamp) == frame.stamp_ns
@@ -333,10 +344,10 @@ def test_every_format_plays(start_node, client, tmp_path, name) -> None:
         (lambda folder: str(folder), ("empty",)),
     ],
 )
-def test_bad_recordings_are_named(start_node, tmp_path, capfd, make, words) -> None:
+def test_bad_recordings_are_named(start_player, tmp_path, capfd, make, words) -> None:
     folder = tmp_path / "empty"
     folder.mkdir()
-    player = start_node(BagPlayerNode, recording=make(folder))
+    player = start_player(recording=make(folder))
     assert player.exit_code == 2
     log = capfd.readouterr().err
     assert all(word in log for word in words), log
@@ -349,7 +360,7 @@ def test_truncated_recording_plays_to_the_damage_and_says_so(client, tmp_path) -
     convert(MemoryRecording([plane_frame(number, camera) for number in range(30)]), path)
     player = NodeProcess(
         "bag_player_node",
-        ros_arguments({"recording": cut(path, 0.7), "rate": 10.0}),
+        player_arguments({"recording": cut(path, 0.7), "rate": 10.0}),
         log=tmp_path / "player.log",
     )
     assert client.spin_until(lambda: player.status is not None, 40.0)
@@ -363,11 +374,11 @@ def test_process_ends_with_the_status_of_the_contract(client, recording, tmp_pat
     viewer = Viewer(client)
     playing = NodeProcess(
         "bag_player_node",
-        ros_arguments({"recording": recording, "rate": 10.0}),
+        player_arguments({"recording": recording, "rate": 10.0}),
         log=tmp_path / "good.log",
     )
     missing = NodeProcess(
-        "bag_player_node", ros_arguments({"recording": "nothing"}), log=tmp_path / "bad.log"
+        "bag_player_node", player_arguments({"recording": "nothing"}), log=tmp_path / "bad.log"
     )
     assert client.spin_until(lambda: playing.status is not None, 40.0)
     assert playing.status == 0, playing.output()

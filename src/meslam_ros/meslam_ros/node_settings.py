@@ -292,8 +292,9 @@ class PlayerSettings:
     loop: bool = setting(False, "start again at the end", live=True)
     clock: bool = setting(True, "publish the images' time on /clock")
     subscribers: int = setting(
-        1,
-        "wait for so many subscribers on each image topic before the first image; 0 does not wait",
+        2,
+        "wait for so many subscribers on each image topic before the first image: the odometry and "
+        "the tracking; 1 where odometry comes from elsewhere; 0 does not wait",
         minimum=0,
         maximum=100,
     )

@@ -11,17 +11,18 @@ from meslam_core.odometry.keyframe_odometry import SAME_MOTION_M, KeyframeOdomet
 from meslam_core.odometry.registration import Registration
 from meslam_core.se3 import Pose, exp
 
-FRAMES = [frame_at(pose, number) for number, pose in enumerate(path(2))]
+FRAMES = [frame_at(pose, number) for number, pose in enumerate(path(3))]
 TRUE = exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0]))
 """What registration finds from a start near it."""
 
 
 class Scripted:
-    """Registers well from near `TRUE` and badly, staying where it is, from anywhere else."""
+    """Registers well from near the truth and badly, staying where it is, from anywhere else."""
 
     def __init__(self, proposed: list[Pose], searched: Pose, **bad: float) -> None:
         self.starts: list[Pose] = []
         self.searches = 0
+        self.true, self.basin_m = TRUE, 0.005
         self._proposed, self._searched = proposed, searched
         self._bad = {"fitness": 0.9, "agreement": 0.9, **bad}
 
@@ -37,8 +38,8 @@ class Scripted:
 
     def register(self, source, target, T_target_source):
         self.starts.append(T_target_source)
-        if np.linalg.norm((T_target_source - TRUE)[:3, 3]) < 0.005:
-            return Registration(TRUE, np.eye(6), 0.95, 0.001, 0.95)
+        if np.linalg.norm((T_target_source - self.true)[:3, 3]) < self.basin_m:
+            return Registration(self.true, np.eye(6), 0.95, 0.001, 0.95)
         return Registration(T_target_source, np.eye(6), residual_m=0.01, **self._bad)
 
 
@@ -57,7 +58,9 @@ def test_a_good_fit_after_a_slow_motion_is_taken_at_once():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"fitness": 0.4}, {"agreement": 0.2}], ids=["fitness", "agreement"]
+    "bad",
+    [{"fitness": 0.5, "agreement": 0.45}, {"fitness": 0.3}, {"agreement": 0.2}],
+    ids=["colour", "fitness", "agreement"],
 )
 @pytest.mark.parametrize("helper", ["proposal", "search"])
 def test_a_bad_fit_is_searched_for_a_better_one(bad, helper):
@@ -66,6 +69,27 @@ def test_a_bad_fit_is_searched_for_a_better_one(bad, helper):
     estimate = second_estimate(Scripted(proposed, searched, **bad))
     assert estimate.valid
     np.testing.assert_allclose(estimate.T_odom_camera, TRUE, atol=1e-9)
+
+
+def test_a_weak_fit_is_taken_where_all_looks_alike_and_the_motion_came_as_predicted():
+    registrar = Scripted([TRUE], TRUE, fitness=0.5, agreement=0.49)
+    registrar.basin_m = 0.0
+    assert second_estimate(registrar).valid
+    assert len(registrar.starts) == 1
+
+
+@pytest.mark.parametrize(("surprise_m", "searches"), [(0.0, False), (0.005, False), (0.02, True)])
+def test_a_fast_motion_that_came_as_predicted_is_taken_at_once(surprise_m, searches):
+    config = MeslamConfig()
+    registrar = Scripted([], np.eye(4))
+    registrar.basin_m = 1.0
+    follower = KeyframeOdometry(registrar, config.odometry, config.sensor)
+    for number, frame in enumerate(FRAMES):
+        moved_m = 0.06 * number + (surprise_m if number == 2 else 0.0)
+        registrar.true = exp(np.array([moved_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        registrar.searches = 0
+        assert follower.process(frame).valid
+    assert (registrar.searches > 0) == searches
 
 
 def test_a_start_where_another_registration_ended_is_not_tried_again():

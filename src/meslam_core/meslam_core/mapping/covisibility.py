@@ -43,7 +43,6 @@ RECOGNITION_ATTEMPTS = 4
 MIN_RECOGNISED_OVERLAP = 0.3
 # They may share little of the view; where they meet, nearly all of it then has to look alike.
 MIN_RECOGNISED_FITNESS = 0.3
-MIN_LIKENESS = 0.95
 # Recognised poses that agree within this are the same [m, rad].
 SAME_PLACE_M = 0.05
 SAME_PLACE_RAD = 0.02
@@ -166,8 +165,8 @@ class CovisibilityLinker:
         if best is None:
             return None
         fits = best.fitness >= MIN_FITNESS and best.agreement >= MIN_AGREEMENT
-        alike = best.agreement >= MIN_LIKENESS * best.fitness
-        return best if fits or (best.fitness >= MIN_RECOGNISED_FITNESS and alike) else None
+        alike = best.fitness >= MIN_RECOGNISED_FITNESS and best.looks_alike
+        return best if fits or alike else None
 
     def _prepare_older(self, number: int) -> Any:
         return self.prepare(self._images.get(number))

@@ -26,7 +26,7 @@ UNKNOWN_VARIANCE = 1.0
 # Within such a motion between two frames the alignment finds the right answer from any guess.
 SAFE_MOTION_M = 0.04
 SAFE_TURN_RAD = 0.05
-# So much a faster motion may differ from its prediction before other answers are looked for.
+# A motion that differs so little from its prediction came as expected.
 EXPECTED_MOTION_M = 0.01
 EXPECTED_TURN_RAD = 0.0125
 # A registration that starts so near to where another one ended ends there, too. Wider limits
@@ -94,7 +94,7 @@ class KeyframeOdometry:
     def _register(self, prepared: Any, guess: Pose, elapsed_s: float) -> tuple[Registration, str]:
         """Register against the keyframe, harder where that is doubtful; why it is invalid."""
         best = self._attempt(prepared, self._keyframe, self._T_odom_keyframe, guess)
-        if not self._fits(best) or self._is_surprising(best, guess):
+        if not self._convinces(best, guess):
             found = [best]
             for target, T_odom_target, start, searched in self._other_starts(prepared, guess):
                 T_keyframe_start = inverse(self._T_odom_keyframe) @ start
@@ -109,23 +109,31 @@ class KeyframeOdometry:
         limits = self._config
         return result.fitness >= limits.good_fitness and result.agreement >= limits.min_agreement
 
+    def _convinces(self, result: Registration, guess: Pose) -> bool:
+        """Whether no other answer needs to be looked for.
+
+        After a slow motion a good fit convinces; after a fast one it may be a wrong one nearby,
+        unless the motion came as it was predicted. Then also a weak fit does, of a noisy image or
+        a view that changes quickly, where what matches looks alike.
+        """
+        correction = inverse(guess) @ self._T_odom_keyframe @ result.T_target_source
+        if not _exceeds(correction, EXPECTED_MOTION_M, EXPECTED_TURN_RAD):
+            return self._fits(result) or (result.looks_alike and not self._is_too_weak(result))
+        predicted = inverse(self._T_odom_last) @ guess
+        return self._fits(result) and not any(
+            _exceeds(motion, SAFE_MOTION_M, SAFE_TURN_RAD) for motion in (correction, predicted)
+        )
+
+    def _is_too_weak(self, result: Registration) -> bool:
+        limits = self._config
+        return result.fitness < limits.min_fitness or result.agreement < limits.min_agreement
+
     def _leads_to(self, T_keyframe_start: Pose, result: Registration) -> bool:
         """Whether a registration that starts there would only end where another one did."""
         apart = inverse(T_keyframe_start) @ result.T_target_source
         return result.fitness >= self._config.min_fitness and not _exceeds(
             apart, SAME_MOTION_M, SAME_TURN_RAD
         )
-
-    def _is_surprising(self, result: Registration, guess: Pose) -> bool:
-        """Whether the motion is such that a result which fits may be a wrong one nearby.
-
-        A fast motion is believed where it came as it was predicted.
-        """
-        T_odom_camera = self._T_odom_keyframe @ result.T_target_source
-        correction = inverse(guess) @ T_odom_camera
-        if _exceeds(inverse(self._T_odom_last) @ guess, SAFE_MOTION_M, SAFE_TURN_RAD):
-            return _exceeds(correction, EXPECTED_MOTION_M, EXPECTED_TURN_RAD)
-        return _exceeds(correction, SAFE_MOTION_M, SAFE_TURN_RAD)
 
     def _other_starts(self, prepared: Any, guess: Pose) -> Iterator[tuple[Any, Pose, Pose, bool]]:
         """Target, its pose, T_odom_camera to start from, and whether that took a search.

@@ -12,6 +12,7 @@ from meslam_core.evaluation.reconstruction import distances
 from meslam_core.recordings.recording import Recording
 from meslam_core.recordings.registry import open_recording
 from meslam_core.se3 import inverse
+from meslam_core.simulation import lighting
 from meslam_core.simulation.scenes import build_scene
 from meslam_core.simulation.sensor import D435_CAMERA
 from meslam_core.simulation.simulator import Simulation, simulate
@@ -103,6 +104,24 @@ def test_without_a_duration_the_camera_goes_round_once():
     assert len(simulation) == round(build_scene("corridor").route.round_s * simulation.fps)
     first, last = simulation.truth.poses[[0, -1]]
     assert np.linalg.norm(first[:3, 3] - last[:3, 3]) < 0.05
+
+
+def test_building_shows_itself_lit_and_patterned_all_along_the_way(monkeypatch):
+    # Soft shadows take most of the time, and nothing here depends on them. The scale is nobody
+    # else's, so that no other test is given this light.
+    monkeypatch.setattr(lighting, "NODE_SPACING_M", 1.0)
+    monkeypatch.setattr(lighting, "SKY_SAMPLES", 4)
+    monkeypatch.setattr(lighting, "LAMP_SIDE_SAMPLES", 1)
+    simulation = simulate("building", seed=3, camera=D435_CAMERA.scaled(0.125))
+    frames = list(simulation.frames(0, None, len(simulation) // 24))
+    brightness = np.array([frame.color.mean() for frame in frames])
+    assert brightness.min() > 50
+    assert brightness.max() < 220
+    assert min(frame.color.std(axis=(0, 1)).max() for frame in frames) > 10
+    # Nothing is farther away than the building is long, and most of it can be measured.
+    depths = [frame.depth_m[frame.depth_m > 0] for frame in frames]
+    assert max(depth.max() for depth in depths) < 28
+    assert np.median([len(depth) for depth in depths]) > 0.7 * frames[0].depth_m.size
 
 
 def test_corridor_has_little_texture():

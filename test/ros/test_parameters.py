@@ -71,7 +71,7 @@ def test_every_setting_is_described_with_type_unit_range_and_meaning(node_with) 
         assert described.type == TYPES[type(entry.default)]
         assert entry.meaning in described.description
         assert entry.unit in described.description
-        assert FIXED in described.additional_constraints
+        assert (LIVE if entry.live else FIXED) in described.additional_constraints
         assert all(choice in described.additional_constraints for choice in entry.choices)
         ranges = [*described.floating_point_range, *described.integer_range]
         for bounds in ranges:
@@ -141,7 +141,7 @@ def test_changes_are_checked_like_values_given_at_start(name, value, words, node
 @pytest.mark.parametrize(
     ("kind", "name", "value"),
     [
-        (TrackingNode, "mapping.iterations", 7),
+        (TrackingNode, "mapping.first_iterations", 7),
         (TrackingNode, "odom_frame", "wheels"),
         (OdometryNode, "sensor.max_depth_m", 3.0),
         (RegionManagerNode, "regions.overlap", 0.3),

@@ -93,7 +93,7 @@ def test_odometry_from_elsewhere_or_none_needs_no_odometry_node(arguments) -> No
         [],
         ["--ros-args", "--params-file", str(ROOT / "config" / "meslam.yaml")],
         # The nodes say themselves what is wrong with their parameters.
-        ["--ros-args", "-p", "odometry_topic:=3"],
+        ["--ros-args", "-p", "odometry_topic:=true"],
         ["--ros-args", "--params-file", "/nowhere.yaml"],
     ],
 )

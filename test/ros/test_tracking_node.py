@@ -267,6 +267,22 @@ def test_a_shorter_queue_counts_at_once_and_says_what_it_dropped(start_node, cli
     assert f"queue full: {last.frames_dropped}" in last.drop_reasons
 
 
+def test_the_effort_of_training_changes_while_it_runs(start_node, client) -> None:
+    node = start_node(TrackingNode, **FAST | {"give_way": False})
+    camera = Camera(client)
+    camera.wait()
+    for number in range(3):
+        camera.track(number)
+    steps = {"mapping.iterations": 21, "mapping.keyframe_iterations": 21}
+    results = node.set_parameters([Parameter(name, value=n) for name, n in steps.items()])
+    assert all(result.successful for result in results)
+    # A status tells of the training on the frame before.
+    assert [camera.track(number).iterations for number in (3, 4)][-1] == 21
+    client.call(Trigger, topics.RESET)
+    fresh = [camera.track(number).iterations for number in range(5, 8)]
+    assert fresh[-1] == 21
+
+
 def test_reset_and_pause(start_node, client) -> None:
     start_node(TrackingNode, **FAST)
     camera = Camera(client)

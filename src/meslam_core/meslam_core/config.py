@@ -357,13 +357,33 @@ class MappingConfig:
         0.03, "spread of the samples near the surface", unit="m", minimum=0.005, maximum=0.5
     )
     first_iterations: int = setting(300, "steps on the first frame", minimum=1, maximum=10000)
-    iterations: int = setting(16, "steps a frame", minimum=0, maximum=1000)
-    min_iterations: int = setting(
-        6, "steps a frame even while frames wait to be tracked", minimum=0, maximum=1000
+    iterations: int = setting(
+        16,
+        "steps a frame",
+        minimum=0,
+        maximum=1000,
+        live=True,
     )
-    keyframe_iterations: int = setting(30, "steps on a new keyframe", minimum=0, maximum=1000)
+    min_iterations: int = setting(
+        6,
+        "steps a frame even while frames wait to be tracked",
+        minimum=0,
+        maximum=1000,
+        live=True,
+    )
+    keyframe_iterations: int = setting(
+        30,
+        "steps on a new keyframe",
+        minimum=0,
+        maximum=1000,
+        live=True,
+    )
     final_iterations: int = setting(
-        4000, "steps after the last frame of a recording", minimum=0, maximum=100000
+        4000,
+        "steps after the last frame of a recording",
+        minimum=0,
+        maximum=100000,
+        live=True,
     )
     learning_rate: float = setting(8e-3, "Adam's step for the weights", minimum=1e-6, maximum=0.1)
     pose_learning_rate: float = setting(

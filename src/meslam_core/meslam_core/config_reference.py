@@ -60,8 +60,13 @@ def parameter_file(purpose: str, only: dict[str, dict[str, object]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _listed(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
 def reference() -> str:
     """The reference of all parameters as Markdown."""
+    live = [f"`{entry.path}`" for entry in settings() if entry.live]
     lines = [
         "# Parameters",
         "",
@@ -72,9 +77,10 @@ def reference() -> str:
         "`--ros-args -p section.name:=value`). A value of another type or outside its range is "
         "refused, and so is a name that does not exist.",
         "",
-        "A node takes these parameters when it is configured, for a map is trained by one set of "
-        "them; while it runs, a change is refused with the way to make it. The nodes' own "
-        "parameters, of which most change at any time, are in [interfaces.md](interfaces.md).",
+        f"While a node runs, {_listed(live)} may change at any time (`ros2 param set`), so that "
+        "the map costs less or more. The others it takes when it is configured, for a map is "
+        "trained by one set of them: a change is refused then, with the way to make it. The nodes' "
+        "own parameters, of which most change at any time, are in [interfaces.md](interfaces.md).",
         "",
     ]
     for section, entries in _sections():

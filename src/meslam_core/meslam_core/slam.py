@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meslam_core.camera import T_BODY_OPTICAL
-from meslam_core.config import MeslamConfig
+from meslam_core.config import MappingConfig, MeslamConfig
 from meslam_core.continuation import Continuation
 from meslam_core.field import field_device, make_field
 from meslam_core.frame import RgbdFrame
@@ -276,6 +276,18 @@ class Slam:
             return 0
         refinement = self._refinement
         return refinement.steps if refinement else self.config.mapping.final_iterations
+
+    def change_steps(self, mapping: MappingConfig) -> None:
+        """From the next training on take the numbers of steps from another configuration."""
+        changed = replace(
+            self.config.mapping,
+            iterations=mapping.iterations,
+            min_iterations=mapping.min_iterations,
+            keyframe_iterations=mapping.keyframe_iterations,
+            final_iterations=mapping.final_iterations,
+        )
+        self.config = replace(self.config, mapping=changed)
+        self.optimizer.config = changed
 
     def finish(self) -> None:
         """Refine once more over everything seen; then mark the observed space anew."""

@@ -6,9 +6,10 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 
 from meslam_core import se3
-from meslam_core.config import MeslamConfig
+from meslam_core.config import MappingConfig, MeslamConfig
 from meslam_core.continuation import Continuation
 from meslam_core.frame import RgbdFrame
 from meslam_core.mapping.refinement import REFINING_STEPS
@@ -115,6 +116,12 @@ class MappingSession:
         else:
             self._slam.begin_at(T_map_camera)
         self._mount = mount
+
+    def change_steps(self, mapping: MappingConfig) -> None:
+        """From the next training on take the numbers of steps from another configuration."""
+        self._config = replace(self._config, mapping=mapping)
+        if self._slam is not None:
+            self._slam.change_steps(mapping)
 
     def wait(self) -> None:
         """Wait until the frames before are mapped; afterwards the regions keep still."""

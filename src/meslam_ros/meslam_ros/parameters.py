@@ -56,12 +56,17 @@ def declare_settings(node: Node, kind: type[S]) -> S:
     return current
 
 
-def declare_config(node: Node, sections: Iterable[str]) -> MeslamConfig:
+def declare_config(
+    node: Node,
+    sections: Iterable[str],
+    changed: Callable[[MeslamConfig], None] = lambda config: None,
+) -> MeslamConfig:
     """Declare `section.name` parameters of the method and return the configuration.
 
     Args:
         node: to declare on.
         sections: of `MeslamConfig` that the node uses; the rest keep their defaults.
+        changed: called with the configuration when parameters of it have changed.
 
     Raises:
         ConfigError: when a given value has the wrong type or is out of range.
@@ -69,7 +74,13 @@ def declare_config(node: Node, sections: Iterable[str]) -> MeslamConfig:
     wanted = set(sections)
     entries = {entry.path: entry for entry in settings() if entry.section in wanted}
     config = _config(entries.values(), lambda entry: _declare(node, entry))
+
+    def follow(parameters: Sequence[Parameter]) -> None:
+        if any(parameter.name in entries for parameter in parameters):
+            changed(read_config(node))
+
     _guard(node, entries)
+    node.add_post_set_parameters_callback(follow)
     return config
 
 

@@ -52,7 +52,7 @@ class TrackingNode(ManagedNode):
         self._frames = declare_settings(self, FrameSettings)
         self._inputs = declare_settings(self, InputSettings)
         self._settings = declare_settings(self, TrackingSettings)
-        self._config = declare_config(self, MeslamConfig().to_mapping())
+        self._config = declare_config(self, MeslamConfig().to_mapping(), self._change_steps)
 
     def configure(self) -> None:
         self._config = read_config(self)
@@ -139,6 +139,11 @@ class TrackingNode(ManagedNode):
         self._begin_anew(session)
         doing = "poses are found in" if session.localises else "mapping goes on in"
         self.get_logger().info(f"{doing} the stored map {session.map_id}")
+
+    def _change_steps(self, config: MeslamConfig) -> None:
+        if self.configured:
+            self._config = config
+            self._session.change_steps(config.mapping)
 
     def _frames_wait(self) -> bool:
         return self._settings.give_way and self._worker.waiting > 0

@@ -54,7 +54,6 @@ class FrameTraining:
         frames_wait: Callable[[], bool],
     ) -> None:
         self.latest = Training()
-        self._config = config.mapping
         self._atlas = atlas
         self._optimizer = optimizer
         self._frames_wait = frames_wait
@@ -77,7 +76,7 @@ class FrameTraining:
     def start_first(self) -> None:
         """Begin to train the first region from nothing, with the first keyframe."""
         self._trained = [self._atlas.working]
-        self._steps_owed = self._config.first_iterations
+        self._steps_owed = self._optimizer.config.first_iterations
         self._worker.start(self._train_first)
 
     def start(self, current: Rays, T_map_current: Pose, keyframe: NewKeyframe | None) -> None:
@@ -88,7 +87,7 @@ class FrameTraining:
             T_map_current: (4, 4) its pose.
             keyframe: what it is as a keyframe, where it is one.
         """
-        config = self._config
+        config = self._optimizer.config
         steps = config.iterations if keyframe is None else config.keyframe_iterations
         steps += min(self._steps_owed, MADE_UP_A_FRAME)
         self._trained = self._next_to_train()
@@ -138,7 +137,7 @@ class FrameTraining:
         if keyframe is not None:
             self._registration.add(keyframe)
             pose = self._registration.proceed(registers) @ pose
-        least = self._config.min_iterations
+        least = self._optimizer.config.min_iterations
         losses = self._optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
         )

@@ -30,7 +30,7 @@ RESIDUAL_STRIDE = 16
 INDEPENDENT_CORRESPONDENCES = 10.0
 
 
-# Of what matches in depth, at least 0.97 had the same colour in right registrations, at most 0.93 in
+# Of what matches in depth at least 0.97 had the same colour in right registrations, at most 0.93 in
 # wrong ones.
 MIN_LIKENESS = 0.95
 

@@ -191,6 +191,25 @@ def test_odometry_that_is_started_again_is_no_motion(start_node, client, topic: 
         assert np.linalg.norm((inverse(truth) @ T_map_base)[:3, 3]) < 0.015
 
 
+def test_only_the_first_image_waits_for_odometry_that_is_silent(start_node, client) -> None:
+    """One that was killed counts as a publisher until the middleware notices."""
+    timeout_s = 4.0
+    start_node(TrackingNode, **FAST | {"odometry_timeout_s": timeout_s})
+    odometry = client.node.create_publisher(Odometry, topics.ODOMETRY, STREAM)
+    camera = Camera(client)
+    camera.wait()
+    assert client.spin_until(lambda: odometry.get_subscription_count() == 1, ANSWER_S)
+    latencies = [camera.track(number).latency_s for number in range(3)]
+    assert latencies[0] >= timeout_s
+    assert max(latencies[1:]) < timeout_s
+    message = Odometry(child_frame_id=BASE_FRAME)
+    message.header.frame_id = "odom"
+    for number in (3, 4):
+        message.header.stamp = to_stamp(NANOSECONDS + number * PERIOD_NS)
+        odometry.publish(message)
+    assert camera.track(3).odometry_valid
+
+
 def test_wheels_that_nothing_connects_to_the_camera_are_named(start_node, client, capfd) -> None:
     start_node(TrackingNode, **FAST | {"odometry_topic": "wheels/odom"})
     wheels = client.node.create_publisher(Odometry, "wheels/odom", STREAM)

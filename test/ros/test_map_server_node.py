@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from data.analytic_scene import GRID, SphereInRoom, learnt_field, stored
+from data.map_client import SCENE, WAIT_S, Code, fill, listed, model, publish, query, two_regions
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import PointCloud2
@@ -21,30 +21,18 @@ from meslam_interfaces.srv import (
     ExportMap,
     GetMesh,
     GetOccupancyGrid,
-    ListRegions,
     LoadMap,
-    QueryOccupancy,
     SaveMap,
 )
 from meslam_ros import topics
-from meslam_ros.client import MeslamClient
 from meslam_ros.map_server_node import MapServerNode
 from meslam_ros.qos import STREAM, latched
-from meslam_ros.region_messages import region_model
 from meslam_ros.transforms import StaticBroadcaster
-
-WAIT_S = 20.0
-SCENE = SphereInRoom()
-Code = ExportMap.Response
 
 
 @pytest.fixture(scope="module")
 def regions() -> list[StoredRegion]:
-    """Two neighbours that both know the sphere in the room."""
-    field = learnt_field()
-    center = GRID.center((1, 0, 0))
-    neighbour = stored(field, SCENE, (1, 0, 0), (center[0], center[1], center[2]))
-    return [stored(field, SCENE), neighbour]
+    return two_regions()
 
 
 @pytest.fixture
@@ -55,34 +43,6 @@ def folders(tmp_path: Path) -> dict[str, str]:
 @pytest.fixture
 def server(start_node, folders):
     return start_node(MapServerNode, **folders)
-
-
-def publish(client: MeslamClient, *models: RegionModel) -> None:
-    """Publish models as tracking does; the publishers live as long as the client."""
-    for model in models:
-        publisher = client.node.create_publisher(RegionModel, topics.REGION_MODELS, latched())
-        publisher.publish(model)
-
-
-def model(region: StoredRegion, map_id: str = "first") -> RegionModel:
-    return region_model(region, map_id, "map", "int8")
-
-
-def listed(client: MeslamClient) -> ListRegions.Response:
-    return client.call(ListRegions, topics.LIST_REGIONS)
-
-
-def fill(client: MeslamClient, *regions: StoredRegion) -> None:
-    """Give the server regions and wait until it has them."""
-    publish(client, *(model(region) for region in regions))
-    assert client.spin_until(lambda: len(listed(client).regions.regions) == len(regions), WAIT_S)
-
-
-def query(client: MeslamClient, points: np.ndarray, **fields) -> QueryOccupancy.Response:
-    request = QueryOccupancy.Request(
-        points=array.array("f", np.asarray(points, np.float32).reshape(-1).tolist()), **fields
-    )
-    return client.call(QueryOccupancy, topics.QUERY_OCCUPANCY, request)
 
 
 def test_empty_map_says_so(server, client, tmp_path) -> None:
@@ -275,102 +235,6 @@ def test_damaged_map_is_named_and_the_rest_loads(server, client, regions, folder
     broken = client.call(LoadMap, topics.LOAD_MAP, LoadMap.Request(name="map.meslam"))
     assert broken.result == Code.INVALID_DATA
     assert len(listed(client).regions.regions) == 1
-
-
-def export_request(**fields) -> ExportMap.Request:
-    return ExportMap.Request(**{"path": "mesh.ply", **fields})
-
-
-def boxed(low: float, high: float) -> ExportMap.Request:
-    request = export_request(use_box=True, resolution_m=0.05)
-    for corner, value in ((request.box_min, low), (request.box_max, high)):
-        corner.x = corner.y = corner.z = value
-    return request
-
-
-NAN = float("nan")
-MALFORMED = [
-    (ExportMap, topics.EXPORT_MAP, export_request(path="/tmp/mesh.ply"), 2, "leading"),
-    (ExportMap, topics.EXPORT_MAP, export_request(path="../mesh.ply"), 2, "'..'"),
-    (ExportMap, topics.EXPORT_MAP, export_request(path="a/../../mesh.ply"), 2, "'..'"),
-    (ExportMap, topics.EXPORT_MAP, export_request(path=""), 2, "name"),
-    (ExportMap, topics.EXPORT_MAP, export_request(path="."), 2, "."),
-    (ExportMap, topics.EXPORT_MAP, export_request(path="x" * 300 + ".ply"), 2, "name"),
-    (ExportMap, topics.EXPORT_MAP, export_request(path="mesh.exe"), 2, ".ply"),
-    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=-1.0), 2, "resolution"),
-    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=NAN), 2, "resolution"),
-    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=1e-6), 2, "resolution"),
-    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=1e6), 2, "resolution"),
-    (ExportMap, topics.EXPORT_MAP, export_request(resolution_m=0.006), 6, "max_cells"),
-    (ExportMap, topics.EXPORT_MAP, boxed(1.0, -1.0), 2, "box"),
-    (ExportMap, topics.EXPORT_MAP, boxed(NAN, 1.0), 2, "box"),
-    (ExportMap, topics.EXPORT_MAP, boxed(50.0, 60.0), 7, "no surface"),
-    (
-        ExportMap,
-        topics.EXPORT_MAP,
-        export_request(regions=[RegionIndex(index=[5, 5, 5])]),
-        1,
-        "(5, 5, 5)",
-    ),
-    (SaveMap, topics.SAVE_MAP, SaveMap.Request(name="../map"), 2, "'..'"),
-    (LoadMap, topics.LOAD_MAP, LoadMap.Request(name="/etc"), 2, "leading"),
-    (LoadMap, topics.LOAD_MAP, LoadMap.Request(name="nothing.meslam"), 1, "no map"),
-    (QueryOccupancy, topics.QUERY_OCCUPANCY, QueryOccupancy.Request(), 2, "no points"),
-    (
-        QueryOccupancy,
-        topics.QUERY_OCCUPANCY,
-        QueryOccupancy.Request(points=[1.0, 2.0]),
-        2,
-        "x, y, z",
-    ),
-    (
-        QueryOccupancy,
-        topics.QUERY_OCCUPANCY,
-        QueryOccupancy.Request(points=[0.0, 0.0, 0.0, NAN, 0.0, 0.0]),
-        2,
-        "point 1",
-    ),
-    (
-        QueryOccupancy,
-        topics.QUERY_OCCUPANCY,
-        QueryOccupancy.Request(points=[0.0] * 3003),
-        6,
-        "max_points",
-    ),
-    (
-        GetOccupancyGrid,
-        topics.GET_OCCUPANCY_GRID,
-        GetOccupancyGrid.Request(use_heights=True, min_height_m=1.0, max_height_m=-1.0),
-        2,
-        "lowest first",
-    ),
-    (
-        GetOccupancyGrid,
-        topics.GET_OCCUPANCY_GRID,
-        GetOccupancyGrid.Request(resolution_m=NAN),
-        2,
-        "resolution",
-    ),
-]
-
-
-def test_malformed_requests_get_their_code_and_harm_nothing(
-    start_node, client, regions, folders, tmp_path
-) -> None:
-    start_node(MapServerNode, max_points=1000, max_cells=3_000_000, **folders)
-    fill(client, regions[0])
-    for kind, name, request, code, word in MALFORMED:
-        answer = client.call(kind, name, request)
-        assert answer.result == code, (name, request, answer.message)
-        assert word in answer.message, (name, request, answer.message)
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
-    frame = QueryOccupancy.Request(points=[0.0, 0.0, 0.0])
-    frame.header.frame_id = "nowhere"
-    answer = client.call(QueryOccupancy, topics.QUERY_OCCUPANCY, frame)
-    assert answer.result == Code.NOT_FOUND
-    assert "nowhere" in answer.message
-    # After all that it still works.
-    assert query(client, [[1.2, 0, 0]]).result == Code.SUCCESS
 
 
 def test_folder_that_cannot_be_written_is_named(start_node, client, regions, tmp_path) -> None:

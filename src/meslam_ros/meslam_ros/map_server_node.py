@@ -38,6 +38,7 @@ from meslam_ros.qos import MODELS_DEPTH, latched
 from meslam_ros.region_messages import model_name
 from meslam_ros.rgbd_input import STEADY
 from meslam_ros.served_map import ServedMap
+from meslam_ros.start_map import StartMap
 from meslam_ros.store_requests import StoreRequests
 from meslam_ros.tracking_client import TrackingClient
 from meslam_ros.transform_buffer import TransformBuffer
@@ -62,14 +63,14 @@ class MapServerNode(ManagedNode):
         self._keeper = MapKeeper(
             self._models, self._kept_folder, self._settings, log.info, log.warn
         )
-        if self._settings.restore and (restored := self._keeper.restore()):
-            log.info(f"serving the map kept in {restored} until another one comes")
         self._refused: Counter[str] = Counter()
         self._transforms = TransformBuffer(self)
         served = ServedMap(self._models, self._settings, self._frames.map_frame)
         self._tracking = TrackingClient(self)
         requests = MapRequests(served, self._config.regions.overlap, self._lookup)
         meshes, stores = MeshRequests(served), StoreRequests(served, self._tracking.use_map)
+        self._start_map = StartMap(self._settings, stores, self._tracking, log.info, log.error)
+        self._load_first_map()
         # Of what takes long one runs at a time, so that threads are left for the rest.
         quick, mesh, grid, store, export = (
             ReentrantCallbackGroup(),
@@ -90,6 +91,13 @@ class MapServerNode(ManagedNode):
         self._export = ExportActionServer(self, meshes, log.error)
         self._diagnostics = Diagnostics(self)
 
+    def _load_first_map(self) -> None:
+        """Serve the map that the parameters ask for, else the one that was kept last."""
+        if self._start_map.load() or not self._settings.restore:
+            return
+        if restored := self._keeper.restore():
+            self.get_logger().info(f"serving the map kept in {restored} until another one comes")
+
     @property
     def _kept_folder(self) -> Path:
         """Another one for each namespace: systems side by side do not mix their maps."""
@@ -98,6 +106,7 @@ class MapServerNode(ManagedNode):
 
     def activate(self) -> None:
         self._keeper.start()
+        self._start_map.start()
         self._subscription = self.create_subscription(
             RegionModel,
             topics.REGION_MODELS,
@@ -112,6 +121,7 @@ class MapServerNode(ManagedNode):
         self.destroy_timer(self._timer)
         self._topics.close()
         self.destroy_subscription(self._subscription)
+        self._start_map.close()
         self._keeper.close()
 
     def cleanup(self) -> None:

@@ -182,6 +182,20 @@ class MapServerSettings:
         True,
         "at start, serve the map that was kept last until tracking publishes regions",
     )
+    map: str = setting(
+        "", "stored map below map_folder to start with, instead of the one that was kept last"
+    )
+    map_mode: str = setting(
+        "view",
+        "what it is for: the map server alone (view), tracking too, which trains it further "
+        "(continue) or only finds its poses in it (localise)",
+        choices=("view", "continue", "localise"),
+    )
+    map_start_pose: str = setting(
+        "",
+        "where the base is in it when tracking begins, 'x y z qx qy qz qw', metres; empty for "
+        "the map's origin, where mapping it began",
+    )
     mesh_topic_resolution_m: float = setting(
         0.05,
         "spacing of the mesh on the topic",

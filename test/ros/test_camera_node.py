@@ -239,7 +239,7 @@ def test_a_cameras_own_clock_becomes_this_computers(start_camera, viewer) -> Non
 
 def test_stamps_go_back_only_where_the_clock_was_set_back(start_camera, viewer, capfd) -> None:
     camera = SoftwareCamera()
-    start_camera(Port(camera), silence_timeout_s=1.0)
+    start_camera(Port(camera), silence_timeout_s=6.0)
     number, log = 0, ""
 
     def send_until(condition: Callable[[], bool], offset_ms: float) -> bool:

@@ -238,6 +238,15 @@ class TrackingConfig:
         minimum=0.5,
         maximum=180.0,
     )
+    certain_inlier_ratio: float = setting(
+        0.9,
+        "share of inliers from which on the map alone tells the pose where odometry has failed",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    certain_colour_likeness: float = setting(
+        0.5, "correlation of measured and mapped luma that it takes", minimum=-1.0, maximum=1.0
+    )
     doubted_inlier_ratio: float = setting(
         0.5,
         "share of inliers below which a pose is not trusted where odometry does not support it",

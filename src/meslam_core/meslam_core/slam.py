@@ -176,7 +176,7 @@ class Slam:
         enough = len(pixels) >= MIN_FRAME_PIXELS
         if self._view is not None:
             rays = self._sample(frame, pixels, self.config.tracking.points) if enough else None
-            witness = partial(self._seen_from, frame)
+            witness = partial(self._recognised, frame, rays)
             tracked = self.tracking.track(frame.stamp_ns, self._view, rays, odometry, witness)
             if self.tracking.lost:
                 tracked = self._sought(frame, rays, odometry) or tracked
@@ -315,12 +315,15 @@ class Slam:
         """T_map_camera of every frame as it was known when the frame was done."""
         return self._history.online_trajectory()
 
-    def _seen_from(self, frame: RgbdFrame, T_map_camera: Pose) -> bool | None:
-        """Whether keyframes say that a frame was taken at a pose; None where none can tell."""
+    def _recognised(self, frame: RgbdFrame, rays: Rays | None, before: int | None) -> Pose | None:
+        """Where keyframes before a number show that a frame was taken; None where they do not."""
         assert self._training is not None
+        if rays is None:
+            return None
         # The images of keyframes belong to the training that runs.
         self._training.settle()
-        return self._training.relocaliser.confirms(frame, T_map_camera)
+        sighting = self._training.relocaliser.recognise(frame, rays, before)
+        return None if sighting is None else sighting.alignment.T_map_camera
 
     def _sought(
         self, frame: RgbdFrame, rays: Rays | None, odometry: OdometryEstimate | None
@@ -333,6 +336,11 @@ class Slam:
             return None
         # It looks into regions and keyframes, which belong to the training that runs.
         self._finish_training()
+        refuted = self.tracking.refuted_since
+        if refuted is not None:
+            self._training.relocaliser.forget(refuted)
+            self.atlas.discard(refuted)
+            self.tracking.refuted_since = None
         sighting = self._training.relocaliser.find(frame, rays, self.tracking.believed)
         tracked = self.tracking.recover(frame.stamp_ns, sighting, odometry)
         if sighting is not None and tracked is not None and tracked.trusted:

@@ -84,15 +84,14 @@ def test_what_has_the_same_shape_in_other_colours_is_another_place(mapped_room):
     assert searched.find(pose, believed=pose, frame=repainted) is None
 
 
-def test_a_keyframe_nearby_confirms_a_pose_or_contradicts_it(mapped_room):
+def test_keyframes_that_are_not_asked_or_forgotten_tell_nothing(mapped_room):
     searched = Searched(mapped_room, remembered=True)
-    true = mapped_room.poses[18] @ BESIDE
-    frame = frame_at(true, 7, LARGE)
-    wrong = true @ exp(np.array([0.12, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    assert searched.relocaliser.confirms(frame, true) is True
-    assert searched.relocaliser.confirms(frame, wrong) is False
-    assert searched.relocaliser.confirms(mirrored(frame), true) is False
-    assert Searched(mapped_room, remembered=False).relocaliser.confirms(frame, true) is None
+    frame = frame_at(mapped_room.poses[37], 7, LARGE)
+    assert searched.relocaliser.recognise(frame, sample(frame)).keyframe >= 3
+    earlier = searched.relocaliser.recognise(frame, sample(frame), before=3)
+    assert earlier is None or earlier.keyframe < 3
+    searched.relocaliser.forget(0)
+    assert searched.relocaliser.recognise(frame, sample(frame)) is None
 
 
 def test_without_keyframes_the_map_is_asked_where_the_camera_was_last(mapped_room):

@@ -8,6 +8,8 @@ import pytest
 from meslam_core.config import TrackingConfig
 from meslam_core.frame_result import TrackingState
 from meslam_core.mapping.keyframes import Rays, rays_at
+from meslam_core.odometry import OdometryEstimate
+from meslam_core.se3 import exp
 from meslam_core.tracking import frame_tracking
 from meslam_core.tracking.frame_history import KeyframePoses
 from meslam_core.tracking.frame_tracking import UNTRUSTED_VARIANCE, FrameTracking
@@ -69,3 +71,74 @@ def test_uncertainty_grows_from_where_it_was_until_the_pose_is_lost(mapped_room)
     assert 0.01 < deviations[0] < 0.05
     assert deviations[0] < deviations[1] < deviations[2] < 0.1
     assert deviations[3] == pytest.approx(np.sqrt(UNTRUSTED_VARIANCE))
+
+
+def adrift(room) -> FrameTracking:
+    """Tracking that odometry has led to the room's first pose, and that it has just failed."""
+    tracking = resting(room)
+    rays = whole_view(room)
+    led = tracking.track(2 * PERIOD_NS, room.region, rays, odometry(valid=True))
+    assert tracking.state is TrackingState.OK
+    tracking.history.add(2 * PERIOD_NS, led.T_map_camera, 0, np.eye(4), odometry(valid=True))
+    return tracking
+
+
+def whole_view(room, share: float = 1.0) -> Rays:
+    """Rays of the first frame, of which a share ends where they should."""
+    frame = room.frame(0)
+    rows, columns = np.mgrid[2 : frame.camera.height : 4, 2 : frame.camera.width : 4].reshape(2, -1)
+    rays = rays_at(frame, rows, columns)
+    wrong = np.random.default_rng(0).random(len(rays)) >= share
+    rays.distances_m[wrong] *= 0.7
+    return rays
+
+
+def odometry(valid: bool) -> OdometryEstimate:
+    return OdometryEstimate(0, np.eye(4), np.eye(6), 1.0, 0.0, valid)
+
+
+def test_without_odometry_a_fair_fit_is_a_guess_that_keyframes_confirm_or_refute(mapped_room):
+    here = mapped_room.poses[0]
+    elsewhere = here @ exp(np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    expected = {
+        None: (TrackingState.DEGRADED, True),
+        "here": (TrackingState.OK, True),
+        "elsewhere": (TrackingState.LOST, False),
+    }
+    known = {None: None, "here": here, "elsewhere": elsewhere}
+    for case, (state, trusted) in expected.items():
+        tracking, asked = adrift(mapped_room), []
+
+        def witness(before: int | None, case=case, asked=asked):
+            asked.append(before)
+            return known[case]
+
+        rays = whole_view(mapped_room, share=0.75)
+        tracked = tracking.track(
+            3 * PERIOD_NS, mapped_room.region, rays, odometry(valid=False), witness
+        )
+        assert asked == [len(mapped_room.keyframes)]
+        assert (tracking.state, tracked.trusted) == (state, trusted), case
+        refuted = len(mapped_room.keyframes) if case == "elsewhere" else None
+        assert tracking.refuted_since == refuted
+
+
+def test_without_odometry_a_perfect_fit_needs_no_keyframe(mapped_room):
+    tracking = adrift(mapped_room)
+    tracked = tracking.track(
+        3 * PERIOD_NS,
+        mapped_room.region,
+        whole_view(mapped_room),
+        odometry(valid=False),
+        lambda before: pytest.fail("asked"),
+    )
+    assert tracking.state is TrackingState.OK
+    assert tracked.trusted
+
+
+def test_without_odometry_a_poor_fit_is_not_trained(mapped_room):
+    tracking = adrift(mapped_room)
+    rays = whole_view(mapped_room, share=0.45)
+    tracked = tracking.track(3 * PERIOD_NS, mapped_room.region, rays, odometry(valid=False))
+    assert tracking.state is TrackingState.DEGRADED
+    assert not tracked.trusted

@@ -69,18 +69,18 @@ class PlaceRecall:
         if len(self) > self._most:
             self._forget(_most_alike(poses[self.keyframes]))
 
-    def nearest(self, T_map_camera: Floats, poses: Floats, count: int) -> list[int]:
-        """The keyframes that were taken nearest to a pose, the nearest first.
+    def forget(self, since: int) -> None:
+        """Forget the keyframes from a number on."""
+        for row in reversed(np.flatnonzero(self.keyframes >= since).tolist()):
+            self._forget(row)
 
-        Args:
-            T_map_camera: (4, 4).
-            poses: (K, 4, 4) T_map_camera of all keyframes.
-            count: at most so many.
-        """
-        apart = _apart(T_map_camera[None], poses[self.keyframes])[0]
-        return [self._keyframes[row] for row in np.argsort(apart, kind="stable")[:count]]
-
-    def propose(self, image: KeyframeImage, count: int, tried: Collection[int] = ()) -> list[int]:
+    def propose(
+        self,
+        image: KeyframeImage,
+        count: int,
+        tried: Collection[int] = (),
+        before: int | None = None,
+    ) -> list[int]:
         """Keyframes that look like a view, the most promising first.
 
         Those that most features have their best match in and those with the most similar
@@ -90,10 +90,11 @@ class PlaceRecall:
             image: the view.
             count: at most so many.
             tried: keyframes that were tried in vain, as often as they occur; they come later.
+            before: only keyframes below this number.
         """
         if not len(self):
             return []
-        discount = np.ones(len(self))
+        discount = np.ones(len(self)) if before is None else (self.keyframes < before) * 1.0
         for keyframe in tried:
             discount[self.keyframes == keyframe] *= 0.5
         votes, likeness = discount * self._votes(image), discount * self._likeness(image)
@@ -148,15 +149,10 @@ def _thumbnail(image: KeyframeImage) -> NDArray[np.float16]:
 
 def _most_alike(poses: Floats) -> int:
     """Row of that pose (K, 4, 4) which another one comes nearest to, the older of the two."""
-    apart = _apart(poses, poses)
+    rotations = poses[:, :3, :3].reshape(len(poses), 9)
+    # trace(A^T B) = 1 + 2 cos(angle).
+    cosines = np.clip(0.5 * (rotations @ rotations.T - 1.0), -1.0, 1.0)
+    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
+    apart += LEVER_M * np.arccos(cosines)
     np.fill_diagonal(apart, np.inf)
     return int(np.unravel_index(np.argmin(apart), apart.shape)[0])
-
-
-def _apart(first: Floats, second: Floats) -> Floats:
-    """How far poses (K, 4, 4) are from others (L, 4, 4): (K, L) [m], an angle by `LEVER_M`."""
-    rotations = [poses[:, :3, :3].reshape(len(poses), 9) for poses in (first, second)]
-    # trace(A^T B) = 1 + 2 cos(angle).
-    cosines = np.clip(0.5 * (rotations[0] @ rotations[1].T - 1.0), -1.0, 1.0)
-    apart = np.linalg.norm(first[:, None, :3, 3] - second[None, :, :3, 3], axis=2)
-    return np.asarray(apart + LEVER_M * np.arccos(cosines), np.float64)

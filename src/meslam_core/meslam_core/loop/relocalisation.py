@@ -77,9 +77,22 @@ class Relocaliser:
         """
         if self._linker is None or not len(self.places):
             return self._verified(rays, T_map_believed, BELIEVED_SIGMA, None)
+        return self.recognise(frame, rays)
+
+    def recognise(self, frame: RgbdFrame, rays: Rays, before: int | None = None) -> Sighting | None:
+        """Look for a frame among keyframes; None where it is not recognised for certain.
+
+        Args:
+            frame: its images.
+            rays: its sample, camera frame.
+            before: only keyframes below this number are asked.
+        """
+        if self._linker is None:
+            return None
         image = self._linker.image(frame)
         prepared = self._linker.prepare(image)
-        for keyframe in self.places.propose(image, self._config.candidates, self._tried):
+        count = self._config.candidates
+        for keyframe in self.places.propose(image, count, self._tried, before):
             found = self._linker.find(keyframe, prepared, np.eye(4))
             if found is not None and self._looks_alike(found):
                 pose = self._atlas.keyframes.pose(keyframe) @ found.T_target_source
@@ -90,30 +103,9 @@ class Relocaliser:
             self._tried.append(keyframe)
         return None
 
-    def confirms(self, frame: RgbdFrame, T_map_camera: Pose) -> bool | None:
-        """Whether the image of a keyframe nearby says that the camera is where it seems to be.
-
-        Args:
-            frame: its images.
-            T_map_camera: (4, 4) where the map has it.
-
-        Returns:
-            None where no keyframe is remembered that could tell.
-        """
-        if self._linker is None or not len(self.places):
-            return None
-        prepared = self._linker.prepare(self._linker.image(frame))
-        poses = self._atlas.keyframes.poses()
-        for keyframe in self.places.nearest(T_map_camera, poses, self._config.candidates):
-            guess = inverse(poses[keyframe]) @ T_map_camera
-            found = self._linker.find(keyframe, prepared, guess)
-            if found is None or not self._looks_alike(found):
-                continue
-            apart = inverse(guess) @ found.T_target_source
-            near = float(np.linalg.norm(apart[:3, 3])) <= self._config.agreement_m
-            if near and rotation_angle(apart) <= np.deg2rad(self._config.agreement_deg):
-                return True
-        return False
+    def forget(self, since: int) -> None:
+        """Forget the keyframes from a number on: they were not taken where they seemed to be."""
+        self.places.forget(since)
 
     def _looks_alike(self, found: Registration) -> bool:
         """Whether two images show the same thing, and not only one of the same shape."""

@@ -153,6 +153,13 @@ class RegionAtlas:
         """The region whose centre a position (3,), map frame [m], is nearest to."""
         return self.regions[min(self.regions, key=lambda i: self._off_center(i, position))]
 
+    def discard(self, since: int) -> None:
+        """Train no region on the keyframes from a number on: their poses proved to be wrong."""
+        for region in self.regions.values():
+            # One that has no others is left as it is: nothing else tells what it is of.
+            region.keyframes = [k for k in region.keyframes if k < since] or region.keyframes
+            region.unmarked = [k for k in region.unmarked if k < since]
+
     def look_into(self, region: Region) -> None:
         """Wake a region to be asked; what was looked into before goes back to rest."""
         region.wake()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +16,13 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.frame_history import FrameHistory
-from meslam_core.tracking.plausibility import Plausibility, Witness
+from meslam_core.tracking.plausibility import Plausibility, motion_between
 from meslam_core.tracking.recovery import Recovery
 from meslam_core.tracking.sighting import Sighting
+
+# Tells where a frame was taken, T_map_camera (4, 4), by the keyframes before a number; None where
+# they do not show the place.
+Witness = Callable[[int | None], Pose | None]
 
 # Below this share of inliers the other first guesses are tried too.
 CONFIDENT_INLIERS = 0.85
@@ -53,10 +58,20 @@ class TrackedPose:
 
 @dataclass(frozen=True)
 class _Verdict:
-    """Whether a frame's pose may train the map, and whether the field confirmed it."""
+    """What is made of an alignment.
+
+    Attributes:
+        trusted: whether the frame may train the map.
+        confirmed: whether its pose is what the alignment says, for certain.
+        guessed: whether that is at least the best guess.
+        elsewhere: whether the frame shows a place that is known and not where it seems to be.
+        reason: why it is not confirmed; empty where it is.
+    """
 
     trusted: bool
-    by_field: bool = False
+    confirmed: bool = False
+    guessed: bool = False
+    elsewhere: bool = False
     reason: str = ""
 
 
@@ -71,6 +86,8 @@ class FrameTracking:
     Attributes:
         history: of all frames; who maps the frame adds it.
         state: after the latest frame.
+        refuted_since: the keyframes from this number on were taken where the camera seemed to be
+            and was not; whoever drops them sets it to None.
     """
 
     def __init__(
@@ -83,10 +100,12 @@ class FrameTracking:
         self._T_map_first = np.eye(4) if T_map_first is None else T_map_first
         self.history = FrameHistory()
         self.state = TrackingState.INITIALISING
+        self.refuted_since: int | None = None
         self._tracker = FieldTracker(config)
         self._noise = registered_noise(config)
         self._plausibility = Plausibility(config, self.history)
-        self._recovery = Recovery(relocalisation or RelocalisationConfig())
+        self._relocalisation = relocalisation or RelocalisationConfig()
+        self._recovery = Recovery(self._relocalisation)
         self._untrusted = 0
         self._led_on = False
         self._covariance = np.eye(6) * FIRST_VARIANCE
@@ -98,8 +117,8 @@ class FrameTracking:
 
     @property
     def believed(self) -> Pose:
-        """Where a lost camera was last trusted, or where odometry from elsewhere has it, (4, 4)."""
-        return self.history.pose(-1) if self._led_on else self._plausibility.last_trusted
+        """Where a lost camera was last, or where odometry from elsewhere has it, (4, 4)."""
+        return self.history.pose(-1) if self._led_on else self._plausibility.last_believed
 
     def start(self, T_map_camera: Pose) -> TrackedPose:
         """The first frame's pose is given."""
@@ -112,7 +131,7 @@ class FrameTracking:
         region: Region,
         rays: Rays | None,
         odometry: OdometryEstimate | None,
-        witness: Witness = lambda pose: None,
+        witness: Witness = lambda before: None,
     ) -> TrackedPose:
         """Find a frame's pose.
 
@@ -121,7 +140,7 @@ class FrameTracking:
             region: the working region.
             rays: of the frame, camera frame; None where it has too little depth.
             odometry: its estimate, where there is one.
-            witness: tells whether it was taken at a pose; asked where odometry has failed.
+            witness: tells where it was taken; asked where odometry has failed.
         """
         alignment = None
         verdict = _Verdict(trusted=False, reason="too few pixels with depth")
@@ -132,10 +151,14 @@ class FrameTracking:
         if rays is not None:
             alignment = self._align(region, rays, self._guesses(stamp_ns, odometry), prior)
             verdict = self._judge(stamp_ns, region, rays, alignment, prior, witness)
-        if alignment is not None and verdict.by_field:
+        if alignment is not None and verdict.confirmed:
             return self._confirmed(stamp_ns, alignment)
+        if verdict.trusted:
+            self._plausibility.accept(stamp_ns)
+        if alignment is not None and verdict.guessed:
+            return self._guessed(alignment, verdict)
         self._untrusted = 0 if verdict.trusted else self._untrusted + 1
-        if self._untrusted >= self.config.lost_after_frames:
+        if self._untrusted >= self.config.lost_after_frames or verdict.elsewhere:
             self.state = TrackingState.LOST
             self._recovery.reset()
         else:
@@ -190,6 +213,15 @@ class FrameTracking:
         self._covariance = inverted(alignment.information + np.eye(6))
         self._plausibility.confirm(stamp_ns)
         return TrackedPose(alignment.T_map_camera, self._covariance, True, "", alignment)
+
+    def _guessed(self, alignment: Alignment, verdict: _Verdict) -> TrackedPose:
+        """The field tells the pose, if the camera is where it seems to be."""
+        self._untrusted = 0
+        self.state = TrackingState.DEGRADED
+        self._covariance = inverted(alignment.information + np.eye(6))
+        return TrackedPose(
+            alignment.T_map_camera, self._covariance, verdict.trusted, verdict.reason, alignment
+        )
 
     def _still_lost(self, odometry: OdometryEstimate | None) -> TrackedPose:
         """Where odometry alone has a lost camera, or else where it was."""
@@ -255,7 +287,7 @@ class FrameTracking:
         if alignment.observed_ratio < limits.min_observed_ratio:
             # Beyond what is mapped only odometry knows; without it the map could not grow.
             return _Verdict(
-                trusted=plausibility.supported,
+                trusted=plausibility.followed,
                 reason=f"only {alignment.observed_ratio:.0%} of the view is mapped",
             )
         if alignment.inlier_ratio < limits.min_inlier_ratio:
@@ -264,8 +296,34 @@ class FrameTracking:
         if alignment.residual_m > limits.max_residual_m:
             distance = f"{alignment.residual_m * 100:.1f} cm"
             return _Verdict(trusted=False, reason=f"points lie {distance} off the map")
-        objection = plausibility.objection(stamp_ns, region, rays, alignment, prior, witness)
-        return _Verdict(trusted=not objection, by_field=not objection, reason=objection)
+        pose = alignment.T_map_camera
+        objection = plausibility.impossible(stamp_ns, pose) or plausibility.conflict(prior, pose)
+        if objection:
+            return _Verdict(trusted=False, reason=objection)
+        if not plausibility.doubted or plausibility.certain(region, rays, alignment):
+            return _Verdict(trusted=True, confirmed=True)
+        return self._judge_adrift(region, rays, alignment, witness)
+
+    def _judge_adrift(
+        self, region: Region, rays: Rays, alignment: Alignment, witness: Witness
+    ) -> _Verdict:
+        """What is made of an alignment after odometry has failed."""
+        plausibility = self._plausibility
+        known = witness(plausibility.adrift_since) if plausibility.asks() else None
+        if known is not None:
+            distance, angle = motion_between(known, alignment.T_map_camera)
+            limits = self._relocalisation
+            if distance <= limits.agreement_m and angle <= np.deg2rad(limits.agreement_deg):
+                return _Verdict(trusted=True, confirmed=True)
+            if not plausibility.drifted(distance, angle):
+                self.refuted_since = plausibility.adrift_since
+                reason = f"the view is known from {distance:.2f} m away"
+                return _Verdict(trusted=False, elsewhere=True, reason=reason)
+        unlikely = plausibility.unlikely(region, rays, alignment)
+        if unlikely:
+            return _Verdict(trusted=False, reason=unlikely)
+        reason = "odometry has failed, and nothing known before has been seen since"
+        return _Verdict(trusted=True, guessed=True, reason=reason)
 
 
 def registered_noise(config: TrackingConfig) -> MotionNoise:

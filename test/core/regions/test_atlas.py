@@ -346,6 +346,19 @@ def test_a_lost_camera_looks_into_one_region_after_the_other_and_enters_its_own(
     assert resting.working is first
 
 
+def test_keyframes_that_proved_wrong_are_trained_no_more(atlas):
+    atlas.update(at(0.45))
+    kept = [add_keyframe(atlas, path(1)[0]) for _ in range(2)]
+    wrong = add_keyframe(atlas, path(1)[0])
+    atlas.discard(wrong)
+    for region in atlas.regions.values():
+        assert wrong not in region.keyframes
+        assert set(kept) <= set(region.keyframes)
+    # A region that has nothing else keeps what it has.
+    atlas.discard(0)
+    assert all(region.keyframes for region in atlas.regions.values())
+
+
 def test_a_region_that_was_recognised_takes_over_at_once(resting):
     for step in (0.45, 1.2, 0.55):
         far(resting, at(step))

@@ -61,6 +61,13 @@ ARGUMENTS = {
     "params_file": LaunchArgument("", "parameters of all nodes; empty for the defaults"),
     "export_folder": LaunchArgument("meslam_exports", "export_map writes below it"),
     "map_folder": LaunchArgument("meslam_maps", "save_map and load_map use it"),
+    "map": LaunchArgument("", "stored map below map_folder to start with"),
+    "map_mode": LaunchArgument(
+        "view",
+        "what that map is for: to be served, until tracking has one of its own; or for tracking "
+        "too, which trains it further, or only finds its poses in it",
+        ("view", "continue", "localise"),
+    ),
     "use_sim_time": LaunchArgument("false", "take the time from /clock", FLAG),
 }
 
@@ -127,6 +134,8 @@ def _system(values: Mapping[str, str], share: Path) -> list[NodePlan]:
         "base_frame": _base_frame(values),
         "export_folder": values["export_folder"],
         "map_folder": values["map_folder"],
+        "map": values["map"],
+        "map_mode": values["map_mode"],
         "odometry_topic": values["odometry_topic"],
     }
     return [

@@ -12,8 +12,8 @@ of the true surface that the camera saw to the map's zero crossing, at most the 
 also counts where the map knows nothing; medians over the boxes of the lattice. The jump of the
 surface is taken where regions take over from each other (`meslam_core.evaluation.seams`). The
 error of a region that is come back to is that of its own map alone, always on the surface it had
-observed when it was left first, which is placed by the true poses of the keyframes it had then:
-drift of the path that leads there does not count, and nothing is fitted to the map.
+observed when it was left first, after rigid alignment: where the region lies is what ATE and the
+error of the whole map tell.
 
 Finished runs are kept in benchmarks/.cache and not repeated, unless `--again METHOD` says so.
 Writes a table, JSON and a plot to docs/benchmarks/large_scene.*.

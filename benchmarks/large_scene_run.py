@@ -26,7 +26,13 @@ from numpy.typing import NDArray
 
 from meslam_core.config import MeslamConfig
 from meslam_core.evaluation.reconstruction import sample
-from meslam_core.evaluation.region_error import RegionError, RegionVisits, error_at, in_box
+from meslam_core.evaluation.region_error import (
+    RegionError,
+    RegionVisits,
+    error_at,
+    fitted,
+    in_box,
+)
 from meslam_core.loop.pose_graph import rigid_motion
 from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.map.stored_region import snapshot
@@ -73,10 +79,13 @@ class FrameNote:
 
 
 class RegionSurface:
-    """The error of a region's map without the drift of the path that leads there.
+    """The error of a region's map, wherever the region lies.
 
-    The true surface is placed by the true poses of the keyframes that the region had when it was
-    first asked for, and always the same points count: those that it had observed then.
+    Always the same points of the true surface count: those that the region had observed when it
+    was first asked for. They are placed by the true poses of the keyframes that it had then, and
+    moved rigidly onto its map from there: a correction of the path moves a region and its
+    keyframes by millimetres in relation to each other, which would count although its map has not
+    changed. Where regions lie is what the trajectory's error and that of the whole map tell.
 
     Args:
         slam: whose regions are measured.
@@ -101,7 +110,7 @@ class RegionSurface:
             seen = in_box(placed, self._in_map(keyframes, self._surface))
             self._known[index] = keyframes, self._surface[seen]
         keyframes, points = self._known[index]
-        return error_at(placed, self._in_map(keyframes, points))
+        return error_at(placed, fitted(placed, self._in_map(keyframes, points)))
 
     def _in_map(self, keyframes: list[int], points: NDArray[np.floating]) -> NDArray[np.float64]:
         store = self._slam.keyframes

@@ -12,6 +12,7 @@ from meslam_core.evaluation.region_error import (
     RegionError,
     RegionVisits,
     error_at,
+    fitted,
     in_box,
     region_error,
 )
@@ -92,6 +93,18 @@ def test_the_same_points_count_wherever_a_region_was_moved_to(regions):
     moved = error_at(PlacedRegion(shifted(regions[0]), "auto"), seen)
     assert moved.points == len(seen)
     assert error_at(region, seen).mean_m < moved.mean_m
+
+
+def test_where_a_region_lies_is_no_error_of_its_map(regions):
+    points = wall_points()
+    exact = error_at(PlacedRegion(regions[0], "auto"), points)
+    elsewhere = PlacedRegion(shifted(regions[0]), "auto")
+    assert error_at(elsewhere, points).mean_m > 3 * exact.mean_m
+    moved = fitted(elsewhere, points)
+    assert error_at(elsewhere, moved).mean_m == pytest.approx(exact.mean_m, abs=5e-4)
+    # Rigidly: no point has come nearer to another.
+    before, after = (np.linalg.norm(p[1:] - p[:-1], axis=1) for p in (points, moved))
+    np.testing.assert_allclose(after, before, atol=1e-6)
 
 
 def test_visits_tell_how_a_map_was_left_and_found_again():

@@ -12,6 +12,13 @@ from meslam_core.field.rendering import surface_level
 from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.regions.grid import RegionIndex
 from meslam_core.regions.observed_mask import OBSERVED
+from meslam_core.se3 import exp
+
+FIT_STEPS = 12
+# Distances count in full up to the first and not at all from the second on [m].
+FIT_HUBER_M, FIT_REACH_M = 0.02, 0.08
+# Of the information that a point has at most; less than this a point is none.
+FIT_DAMPING = 1e-2
 
 
 @dataclass(frozen=True)
@@ -66,12 +73,46 @@ def error_at(region: PlacedRegion, surface: NDArray[np.floating]) -> RegionError
     """A region's error at all given points (N, 3) of the true surface, map frame [m]."""
     if not len(surface):
         return RegionError(0, float("nan"), float("nan"))
+    truncation_m = region.stored.architecture.truncation_m
+    off = np.minimum(np.abs(_signed_distance(region, surface)[0]), truncation_m)
+    return RegionError(len(surface), float(np.median(off)), float(off.mean()))
+
+
+def fitted(region: PlacedRegion, surface: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Points of the true surface (N, 3), map frame [m], moved rigidly onto a region's map.
+
+    Where a region lies is a matter of the path; what remains after this is its map's own error.
+    By Gauss-Newton on the field with Huber's weights, damped where the surface says next to
+    nothing about a motion, as along a plain corridor.
+
+    Args:
+        region: ready to answer.
+        surface: within a few centimetres of the region's.
+    """
+    moved = np.asarray(surface, np.float64)
+    for _ in range(FIT_STEPS if len(moved) else 0):
+        off, normals = _signed_distance(region, moved)
+        off_m = np.maximum(np.abs(off), 1e-9)
+        weights = np.minimum(FIT_HUBER_M / off_m, 1.0) * (off_m < FIT_REACH_M)
+        center = moved.mean(axis=0)
+        jacobian = np.concatenate([normals, np.cross(moved - center, normals)], axis=1)
+        information = (jacobian * weights[:, None]).T @ jacobian
+        information += FIT_DAMPING * len(moved) * np.eye(6)
+        motion = exp(-np.linalg.solve(information, (jacobian * weights[:, None]).T @ off))
+        moved = (moved - center) @ motion[:3, :3].T + motion[:3, 3] + center
+    return moved
+
+
+def _signed_distance(
+    region: PlacedRegion, surface: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distance (N,) of points, map frame, to a region's surface [m], and its gradient (N, 3)."""
     architecture = region.stored.architecture
     values, gradient = region.gradient(region.to_local(surface))
-    slope = np.maximum(np.linalg.norm(gradient, axis=1), 1.0 / architecture.truncation_m / 8.0)
-    off = np.abs(values[:, 0] - surface_level(architecture.field_config())) / slope
-    off = np.minimum(off, architecture.truncation_m)
-    return RegionError(len(surface), float(np.median(off)), float(off.mean()))
+    # Where f has saturated its slope tells nothing.
+    slope = np.maximum(np.linalg.norm(gradient, axis=1), 0.125 / architecture.truncation_m)
+    level = surface_level(architecture.field_config())
+    return (values[:, 0] - level) / slope, gradient / slope[:, None]
 
 
 @dataclass

@@ -149,10 +149,12 @@ def _thumbnail(image: KeyframeImage) -> NDArray[np.float16]:
 
 def _most_alike(poses: Floats) -> int:
     """Row of that pose (K, 4, 4) which another one comes nearest to, the older of the two."""
-    rotations = poses[:, :3, :3].reshape(len(poses), 9)
-    # trace(A^T B) = 1 + 2 cos(angle).
-    cosines = np.clip(0.5 * (rotations @ rotations.T - 1.0), -1.0, 1.0)
-    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
-    apart += LEVER_M * np.arccos(cosines)
+    positions = (poses[:, :3, 3] - poses[-1, :3, 3]).astype(np.float32)
+    rotations = poses[:, :3, :3].reshape(len(poses), 9).astype(np.float32)
+    lengths = np.square(positions).sum(axis=1)
+    apart = lengths[:, None] + lengths - 2.0 * (positions @ positions.T)
+    # trace(A^T B) = 1 + 2 cos(angle), and the chord of the angle is sqrt(2 - 2 cos(angle)).
+    chords = 3.0 - rotations @ rotations.T
+    apart = np.sqrt(np.maximum(apart, 0.0)) + LEVER_M * np.sqrt(np.maximum(chords, 0.0))
     np.fill_diagonal(apart, np.inf)
-    return int(np.unravel_index(np.argmin(apart), apart.shape)[0])
+    return int(np.argmin(apart)) // len(poses)

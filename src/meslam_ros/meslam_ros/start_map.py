@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from meslam_core.continuation import read_start_pose
 from meslam_core.errors import MapError
 from meslam_interfaces.srv import LoadMap
 from meslam_ros.answers import Code, RequestError, answering
@@ -96,5 +95,8 @@ class StartMap:
         request = LoadMap.Request(name=self._settings.map, mode=mode)
         if self._settings.map_start_pose:
             request.use_start_pose = True
+            # Brings all of mapping with it, which the server otherwise does without.
+            from meslam_core.continuation import read_start_pose
+
             request.start_pose = to_pose(read_start_pose(self._settings.map_start_pose))
         return request

@@ -322,3 +322,45 @@ def test_topics_show_the_map_to_late_viewers(start_node, client, regions, folder
     assert len(rows) == cloud.width > 100
     assert np.median(np.abs(SCENE.distance_m(rows["position"]))) < 0.02
     assert set(np.unique(grids[-1].data)) == {-1, 0, 100}
+
+
+def test_a_correction_that_moves_a_region_reaches_the_topics(
+    start_node, client, regions, folders
+) -> None:
+    start_node(MapServerNode, mesh_topic_resolution_m=0.1, mesh_topic_period_s=0.2, **folders)
+    fill(client, *regions)
+    meshes: dict[int, Marker] = {}
+    grids: list[OccupancyGrid] = []
+    clouds: list[PointCloud2] = []
+    subscribe = client.node.create_subscription
+    subscribe(Marker, topics.MESH, lambda m: meshes.__setitem__(m.id, m), latched(10))
+    subscribe(OccupancyGrid, topics.OCCUPANCY_GRID, grids.append, latched())
+    subscribe(PointCloud2, topics.MAP_POINTS, clouds.append, latched())
+    assert client.spin_until(lambda: len(meshes) == 2 and bool(grids) and bool(clouds), WAIT_S)
+    lowest = {number: _lowest_x(mesh) for number, mesh in meshes.items()}
+    before = grids[-1].info
+    shift = np.eye(4)
+    shift[0, 3] = -1.0
+    moved = [
+        replace(region, T_map_region=shift @ region.T_map_region, version=region.version + 1)
+        for region in regions
+    ]
+    publish(client, *(model(region) for region in moved))
+
+    def followed() -> bool:
+        shifts = [_lowest_x(meshes[number]) - lowest[number] for number in lowest]
+        corner = grids[-1].info.origin.position.x - before.origin.position.x
+        cloud = np.frombuffer(clouds[-1].data, [("position", "<f4", 3), ("rgb", "<u4")])
+        ball = SCENE.distance_m(cloud["position"] + np.array([1.0, 0.0, 0.0]))
+        return bool(
+            np.allclose(shifts, -1.0, atol=0.05)
+            and abs(corner + 1.0) < 0.051
+            and np.median(np.abs(ball)) < 0.02
+        )
+
+    assert client.spin_until(followed, WAIT_S)
+    assert np.array_equal(query(client, [[-1.0, 0.0, 0.0], [0.2, 0.0, 0.0]]).occupancy, [-1, 0])
+
+
+def _lowest_x(mesh: Marker) -> float:
+    return min(point.x for point in mesh.points)

@@ -10,6 +10,7 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -49,6 +50,7 @@ class MeslamClient:
         self.node = Node(name, context=self._context, namespace=namespace)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._services: dict[str, Client] = {}
         self.poses: dict[int, se3.Pose] = {}
         self.statuses: list[TrackingStatus] = []
         self.path: Path | None = None
@@ -87,16 +89,17 @@ class MeslamClient:
         Raises:
             TimeoutError: when the service is not there or does not answer in time.
         """
-        client = self.node.create_client(kind, name)
-        try:
-            if not self.spin_until(client.service_is_ready, timeout_s):
-                raise TimeoutError(f"the service {name} is not there after {timeout_s:.0f} s")
-            future = client.call_async(kind.Request() if request is None else request)
-            if not self.spin_until(future.done, timeout_s):
-                raise TimeoutError(f"the service {name} has not answered in {timeout_s:.0f} s")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        if name not in self._services:
+            # Kept, for finding the server takes longer than many an answer.
+            self._services[name] = self.node.create_client(kind, name)
+        client = self._services[name]
+        if not self.spin_until(client.service_is_ready, timeout_s):
+            raise TimeoutError(f"the service {name} is not there after {timeout_s:.0f} s")
+        future = client.call_async(kind.Request() if request is None else request)
+        if not self.spin_until(future.done, timeout_s):
+            client.remove_pending_request(future)
+            raise TimeoutError(f"the service {name} has not answered in {timeout_s:.0f} s")
+        return future.result()
 
     @property
     def settled(self) -> bool:

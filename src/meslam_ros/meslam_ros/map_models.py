@@ -11,6 +11,7 @@ import numpy as np
 
 from meslam_core.config import MeslamConfig
 from meslam_core.map.neural_map import NeuralMap
+from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.map.reader import LoadedMap
 from meslam_core.map.store import MapStore
 from meslam_core.map.stored_region import StoredRegion
@@ -83,7 +84,7 @@ class MapModels:
         self._config = config
         self._map_frame = map_frame
         self._lattice: RegionGrid | None = None
-        self._regions: dict[RegionIndex, StoredRegion] = {}
+        self._regions: dict[RegionIndex, PlacedRegion] = {}
         self._data: dict[RegionIndex, bytes] = {}
         self._live_map_id = ""
         self._replaced_map_id = ""
@@ -103,7 +104,7 @@ class MapModels:
         with self._lock:
             if not self._is_wanted(model):
                 return False
-        region = stored_region(model)
+        region = self._placed(stored_region(model))
         if model.map_id != self.map_id:
             self.before_replacing()
         with self._lock:
@@ -113,10 +114,14 @@ class MapModels:
             if model.map_id != self._catalog.map_id:
                 self._begin(model.map_id)
             self._catalog.add(RegionEntry.of(model))
-            self._regions[region.index] = region
-            self._data[region.index] = bytes(model.data)
+            self._regions[region.stored.index] = region
+            self._data[region.stored.index] = bytes(model.data)
             self._snapshot = None
             return True
+
+    def _placed(self, region: StoredRegion) -> PlacedRegion:
+        """A region ready to answer; made once, for it takes milliseconds."""
+        return PlacedRegion(region, self._config.field.backend)
 
     def _is_wanted(self, model: RegionModel) -> bool:
         return model.map_id != self._replaced_map_id and self._catalog.is_news(model)
@@ -130,14 +135,12 @@ class MapModels:
         with self._lock:
             if self._snapshot is None:
                 regions = dict(self._regions)
-                neural_map = NeuralMap(
-                    regions.values(), self._config.map, self._config.field.backend
-                )
+                neural_map = NeuralMap(regions.values(), self._config.map)
                 self._surfaces = MapSurfaces(neural_map, known=self._surfaces)
                 self._snapshot = MapSnapshot(
                     map_id=self._catalog.map_id,
                     stamp_ns=self._catalog.newest_stamp_ns,
-                    versions={index: region.version for index, region in regions.items()},
+                    versions={i: region.stored.version for i, region in regions.items()},
                     map=neural_map,
                     surfaces=self._surfaces,
                 )
@@ -199,16 +202,17 @@ class MapModels:
             encoded_model(region, loaded.encoded[region.index], loaded.map_id, self._map_frame)
             for region in loaded.regions
         ]
+        placed = [self._placed(region) for region in loaded.regions]
         confirm(loaded, models)
         self.before_replacing()
         with self._lock:
             self._begin(loaded.map_id)
             self._lattice = loaded.grid
             self._replaced_map_id = self._live_map_id if self._live_map_id != loaded.map_id else ""
-            for region, model in zip(loaded.regions, models, strict=True):
+            for region, model in zip(placed, models, strict=True):
                 self._catalog.add(RegionEntry.of(model))
-                self._regions[region.index] = region
-                self._data[region.index] = bytes(model.data)
+                self._regions[region.stored.index] = region
+                self._data[region.stored.index] = bytes(model.data)
         return loaded.warnings
 
     def _begin(self, map_id: str) -> None:
@@ -222,7 +226,7 @@ class MapModels:
         """A loaded map's lattice, else the one that the first region and the overlap tell."""
         if self._lattice is not None:
             return self._lattice
-        region = next(iter(self._regions.values()))
+        region = next(iter(self._regions.values())).stored
         grid = RegionGrid(np.zeros(3), region.side_m, self._config.regions.overlap)
         origin = region.T_map_region[:3, 3] - grid.center(region.index)
         return RegionGrid(origin, region.side_m, self._config.regions.overlap)

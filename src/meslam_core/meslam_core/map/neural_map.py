@@ -51,7 +51,8 @@ class NeuralMap:
     one blended field. Where no region has observed a point the answer is unknown.
 
     Args:
-        regions: at rest; networks of different width may be mixed, other truncations may not.
+        regions: at rest; those of another map are taken as they are. Networks of different width
+            may be mixed, other truncations may not.
         config: blending length in half-sides.
         backend: of the networks, as in `FieldConfig.backend`.
 
@@ -61,12 +62,15 @@ class NeuralMap:
 
     def __init__(
         self,
-        regions: Iterable[StoredRegion],
+        regions: Iterable[StoredRegion | PlacedRegion],
         config: MapConfig | None = None,
         backend: str = "auto",
     ) -> None:
         self.config = config or MapConfig()
-        self.regions = [PlacedRegion(stored, backend) for stored in regions]
+        self.regions = [
+            region if isinstance(region, PlacedRegion) else PlacedRegion(region, backend)
+            for region in regions
+        ]
         if not self.regions:
             raise MapError("the map holds no region; nothing has been mapped yet")
         architecture = self.regions[0].stored.architecture

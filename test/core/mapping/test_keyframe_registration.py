@@ -123,3 +123,21 @@ def test_regions_in_doubt_are_asked_in_turn(monkeypatch):
     awake = [region.index for region in arriving.atlas.doubtful]
     assert len(awake) == 2
     assert asked == awake + awake
+
+
+def test_where_the_camera_is_comes_before_links(monkeypatch):
+    arriving = Arriving(lambda: True)
+    arriving.add(4)
+    arriving.atlas.working.confirmed = False
+    arriving.atlas.settle()
+    monkeypatch.setattr(
+        arriving.registration.recogniser, "ask", lambda *_: iter([None, None, None])
+    )
+    before = len(arriving.linked)
+    arriving.add(1)
+    for _ in range(2):
+        arriving.registration.proceed(0)
+    assert len(arriving.linked) == before
+    arriving.registration.proceed(1)
+    arriving.registration.proceed(1)
+    assert len(arriving.linked) > before

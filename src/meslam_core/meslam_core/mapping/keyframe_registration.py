@@ -52,6 +52,7 @@ class KeyframeRegistration:
         self._keyframes = atlas.keyframes
         self._frames_wait = frames_wait
         self._behind: deque[Iterator[None]] = deque(maxlen=KEYFRAMES_BEHIND)
+        self._asking: Iterator[None] | None = None
         self._linker: CovisibilityLinker | None = None
         self.recogniser: RegionRecogniser | None = None
         if config.keyframes.links:
@@ -67,7 +68,12 @@ class KeyframeRegistration:
         number, frame, rays = keyframe
         self._linker.keep(number, frame)
         self.relocaliser.remember(number)
-        self._behind.append(self._registrations(self._linker, number, frame.camera, rays))
+        doubtful = self._atlas.doubtful
+        if doubtful and self._asking is None and self.recogniser is not None:
+            # One after the other: the first may be where no older keyframe was.
+            region = doubtful[number % len(doubtful)]
+            self._asking = self.recogniser.ask(region, number, frame.camera, rays)
+        self._behind.append(self._links(self._linker, number, frame.camera, rays))
 
     def proceed(self, least: int = 1) -> Pose:
         """Make the registrations that are due.
@@ -83,11 +89,10 @@ class KeyframeRegistration:
         newest = len(self._keyframes) - 1
         before = self._keyframes.pose(newest)
         done = 0
-        while self._behind and not (done >= least and self._frames_wait()):
-            if next(self._behind[0], self) is self:
-                self._behind.popleft()
-            else:
-                done += 1
+        # Until the camera is recognised, the region that it came back to waits.
+        least = least if self._asking is None else 1
+        while not (done >= least and self._frames_wait()) and self._step():
+            done += 1
         if self._corrections == corrections:
             return np.eye(4)
         return self._keyframes.pose(newest) @ inverse(before)
@@ -96,15 +101,22 @@ class KeyframeRegistration:
     def _corrections(self) -> int:
         return self.recogniser.corrections if self.recogniser else 0
 
-    def _registrations(
+    def _step(self) -> bool:
+        """Make one registration; whether there was one to make."""
+        if self._asking is not None:
+            if next(self._asking, self) is not self:
+                return True
+            self._asking = None
+        while self._behind:
+            if next(self._behind[0], self) is not self:
+                return True
+            self._behind.popleft()
+        return False
+
+    def _links(
         self, linker: CovisibilityLinker, number: int, camera: PinholeCamera, rays: Rays
     ) -> Iterator[None]:
-        """One registration after the other: where it is, and then what else it sees."""
-        if self.recogniser is not None:
-            # One after the other: the first may be where no older keyframe was.
-            doubtful = self._atlas.doubtful
-            for region in doubtful[number % max(len(doubtful), 1) :][:1]:
-                yield from self.recogniser.ask(region, number, camera, rays)
+        """Link a keyframe with older ones, a registration at a time."""
         for attempt, link in enumerate(linker.link(number, camera, rays), 1):
             if link is not None:
                 self._keyframes.add_link(link.first, link.second, link.T_first_second)

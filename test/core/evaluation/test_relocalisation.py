@@ -15,7 +15,6 @@ from meslam_core.evaluation.relocalisation import (
     carried,
     dark,
     mirrored,
-    share_within,
 )
 from meslam_core.frame import RgbdFrame
 from meslam_core.se3 import inverse, rotation_angle
@@ -81,4 +80,3 @@ def test_a_covered_camera_measures_nothing():
 )
 def test_found_means_soon_and_in_the_right_place(result, good):
     assert result.within(2.0) is good
-    assert share_within([result, outcome(0.1)], 2.0) == (1.0 if good else 0.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -226,11 +226,6 @@ def mirrored(frame: RgbdFrame) -> RgbdFrame:
 def dark(frame: RgbdFrame) -> RgbdFrame:
     """What a covered camera sees at that instant: no light, no depth."""
     return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
-
-
-def share_within(outcomes: Sequence[Outcome], seconds: float) -> float:
-    """Share of trials after which the camera was found in so short a time."""
-    return sum(each.within(seconds) for each in outcomes) / max(len(outcomes), 1)
 
 
 def _alignment(mapped: Trajectory, truth: Trajectory) -> Pose:

@@ -336,11 +336,10 @@ class Slam:
             return None
         # It looks into regions and keyframes, which belong to the training that runs.
         self._finish_training()
-        refuted = self.tracking.refuted_since
+        refuted = self.tracking.take_refuted()
         if refuted is not None:
             self._training.relocaliser.forget(refuted)
             self.atlas.discard(refuted)
-            self.tracking.refuted_since = None
         sighting = self._training.relocaliser.find(frame, rays, self.tracking.believed)
         tracked = self.tracking.recover(frame.stamp_ns, sighting, odometry)
         if sighting is not None and tracked is not None and tracked.trusted:

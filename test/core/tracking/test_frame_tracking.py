@@ -120,7 +120,8 @@ def test_without_odometry_a_fair_fit_is_a_guess_that_keyframes_confirm_or_refute
         assert asked == [len(mapped_room.keyframes)]
         assert (tracking.state, tracked.trusted) == (state, trusted), case
         refuted = len(mapped_room.keyframes) if case == "elsewhere" else None
-        assert tracking.refuted_since == refuted
+        assert tracking.take_refuted() == refuted
+        assert tracking.take_refuted() is None
 
 
 def test_without_odometry_a_perfect_fit_needs_no_keyframe(mapped_room):

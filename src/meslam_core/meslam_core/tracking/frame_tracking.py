@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,13 +15,10 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.frame_history import FrameHistory
-from meslam_core.tracking.plausibility import Plausibility, motion_between
+from meslam_core.tracking.judge import Judge, Verdict, Witness
+from meslam_core.tracking.plausibility import Plausibility
 from meslam_core.tracking.recovery import Recovery
 from meslam_core.tracking.sighting import Sighting
-
-# Tells where a frame was taken, T_map_camera (4, 4), by the keyframes before a number; None where
-# they do not show the place.
-Witness = Callable[[int | None], Pose | None]
 
 # Below this share of inliers the other first guesses are tried too.
 CONFIDENT_INLIERS = 0.85
@@ -56,25 +52,6 @@ class TrackedPose:
     reference: int | None = None
 
 
-@dataclass(frozen=True)
-class _Verdict:
-    """What is made of an alignment.
-
-    Attributes:
-        trusted: whether the frame may train the map.
-        confirmed: whether its pose is what the alignment says, for certain.
-        guessed: whether that is at least the best guess.
-        elsewhere: whether the frame shows a place that is known and not where it seems to be.
-        reason: why it is not confirmed; empty where it is.
-    """
-
-    trusted: bool
-    confirmed: bool = False
-    guessed: bool = False
-    elsewhere: bool = False
-    reason: str = ""
-
-
 class FrameTracking:
     """Finds the pose of one frame after the other.
 
@@ -86,8 +63,6 @@ class FrameTracking:
     Attributes:
         history: of all frames; who maps the frame adds it.
         state: after the latest frame.
-        refuted_since: the keyframes from this number on were taken where the camera seemed to be
-            and was not; whoever drops them sets it to None.
     """
 
     def __init__(
@@ -100,12 +75,12 @@ class FrameTracking:
         self._T_map_first = np.eye(4) if T_map_first is None else T_map_first
         self.history = FrameHistory()
         self.state = TrackingState.INITIALISING
-        self.refuted_since: int | None = None
         self._tracker = FieldTracker(config)
         self._noise = registered_noise(config)
         self._plausibility = Plausibility(config, self.history)
-        self._relocalisation = relocalisation or RelocalisationConfig()
-        self._recovery = Recovery(self._relocalisation)
+        relocalisation = relocalisation or RelocalisationConfig()
+        self._judge = Judge(config, relocalisation, self._plausibility)
+        self._recovery = Recovery(relocalisation)
         self._untrusted = 0
         self._led_on = False
         self._covariance = np.eye(6) * FIRST_VARIANCE
@@ -114,6 +89,11 @@ class FrameTracking:
     def lost(self) -> bool:
         """Whether the camera has to be found in the map before tracking goes on."""
         return self.state in (TrackingState.LOST, TrackingState.RELOCALISING)
+
+    def take_refuted(self) -> int | None:
+        """The keyframes from this number on were not taken where they seemed to be; told once."""
+        since, self._judge.refuted_since = self._judge.refuted_since, None
+        return since
 
     @property
     def believed(self) -> Pose:
@@ -143,14 +123,14 @@ class FrameTracking:
             witness: tells where it was taken; asked where odometry has failed.
         """
         alignment = None
-        verdict = _Verdict(trusted=False, reason="too few pixels with depth")
+        verdict = Verdict(trusted=False, reason="too few pixels with depth")
         self._plausibility.pass_by(odometry)
         if self.lost:
             return self._still_lost(odometry)
         prior = self._prior(stamp_ns, odometry)
         if rays is not None:
             alignment = self._align(region, rays, self._guesses(stamp_ns, odometry), prior)
-            verdict = self._judge(stamp_ns, region, rays, alignment, prior, witness)
+            verdict = self._judge.verdict(stamp_ns, region, rays, alignment, prior, witness)
         if alignment is not None and verdict.confirmed:
             return self._confirmed(stamp_ns, alignment)
         if verdict.trusted:
@@ -214,7 +194,7 @@ class FrameTracking:
         self._plausibility.confirm(stamp_ns)
         return TrackedPose(alignment.T_map_camera, self._covariance, True, "", alignment)
 
-    def _guessed(self, alignment: Alignment, verdict: _Verdict) -> TrackedPose:
+    def _guessed(self, alignment: Alignment, verdict: Verdict) -> TrackedPose:
         """The field tells the pose, if the camera is where it seems to be."""
         self._untrusted = 0
         self.state = TrackingState.DEGRADED
@@ -270,60 +250,6 @@ class FrameTracking:
         guesses.append(self.history.extrapolated(stamp_ns))
         guesses.append(self.history.pose(-1))
         return [orthonormalized(guess) for guess in guesses]
-
-    def _judge(
-        self,
-        stamp_ns: int,
-        region: Region,
-        rays: Rays,
-        alignment: Alignment,
-        prior: PosePrior,
-        witness: Witness,
-    ) -> _Verdict:
-        """Whether an alignment may be trusted, or odometry in its place."""
-        limits, plausibility = self.config, self._plausibility
-        if not np.isfinite(alignment.T_map_camera).all():
-            return _Verdict(trusted=False, reason="the pose is not finite")
-        if alignment.observed_ratio < limits.min_observed_ratio:
-            # Beyond what is mapped only odometry knows; without it the map could not grow.
-            return _Verdict(
-                trusted=plausibility.followed,
-                reason=f"only {alignment.observed_ratio:.0%} of the view is mapped",
-            )
-        if alignment.inlier_ratio < limits.min_inlier_ratio:
-            share = f"{alignment.inlier_ratio:.0%}"
-            return _Verdict(trusted=False, reason=f"only {share} of the points lie on the map")
-        if alignment.residual_m > limits.max_residual_m:
-            distance = f"{alignment.residual_m * 100:.1f} cm"
-            return _Verdict(trusted=False, reason=f"points lie {distance} off the map")
-        pose = alignment.T_map_camera
-        objection = plausibility.impossible(stamp_ns, pose) or plausibility.conflict(prior, pose)
-        if objection:
-            return _Verdict(trusted=False, reason=objection)
-        if not plausibility.doubted or plausibility.certain(region, rays, alignment):
-            return _Verdict(trusted=True, confirmed=True)
-        return self._judge_adrift(region, rays, alignment, witness)
-
-    def _judge_adrift(
-        self, region: Region, rays: Rays, alignment: Alignment, witness: Witness
-    ) -> _Verdict:
-        """What is made of an alignment after odometry has failed."""
-        plausibility = self._plausibility
-        known = witness(plausibility.adrift_since) if plausibility.asks() else None
-        if known is not None:
-            distance, angle = motion_between(known, alignment.T_map_camera)
-            limits = self._relocalisation
-            if distance <= limits.agreement_m and angle <= np.deg2rad(limits.agreement_deg):
-                return _Verdict(trusted=True, confirmed=True)
-            if not plausibility.drifted(distance, angle):
-                self.refuted_since = plausibility.adrift_since
-                reason = f"the view is known from {distance:.2f} m away"
-                return _Verdict(trusted=False, elsewhere=True, reason=reason)
-        unlikely = plausibility.unlikely(region, rays, alignment)
-        if unlikely:
-            return _Verdict(trusted=False, reason=unlikely)
-        reason = "odometry has failed, and nothing known before has been seen since"
-        return _Verdict(trusted=True, guessed=True, reason=reason)
 
 
 def registered_noise(config: TrackingConfig) -> MotionNoise:

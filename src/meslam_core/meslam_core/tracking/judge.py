@@ -1,0 +1,114 @@
+"""What is made of a frame's alignment with the map: a pose, a guess, or nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from meslam_core.config import RelocalisationConfig, TrackingConfig
+from meslam_core.mapping.keyframes import Rays
+from meslam_core.regions.region import Region
+from meslam_core.se3 import Pose
+from meslam_core.tracking.field_tracker import Alignment, PosePrior
+from meslam_core.tracking.plausibility import Plausibility, motion_between
+
+# Tells where a frame was taken, T_map_camera (4, 4), by the keyframes before a number; None where
+# they do not show the place.
+Witness = Callable[[int | None], Pose | None]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is made of an alignment.
+
+    Attributes:
+        trusted: whether the frame may train the map.
+        confirmed: whether its pose is what the alignment says, for certain.
+        guessed: whether that is at least the best guess.
+        elsewhere: whether the frame shows a place that is known and not where it seems to be.
+        reason: why it is not confirmed; empty where it is.
+    """
+
+    trusted: bool
+    confirmed: bool = False
+    guessed: bool = False
+    elsewhere: bool = False
+    reason: str = ""
+
+
+class Judge:
+    """Decides whether alignments may be trusted, or odometry in their place.
+
+    Args:
+        config: limits of what fits the map.
+        relocalisation: how well a pose must agree with what keyframes tell.
+        path: how far the path to the latest frame can be believed.
+
+    Attributes:
+        refuted_since: the keyframes from this number on were taken where the camera seemed to be
+            and was not; whoever drops them sets it to None.
+    """
+
+    def __init__(
+        self, config: TrackingConfig, relocalisation: RelocalisationConfig, path: Plausibility
+    ) -> None:
+        self.refuted_since: int | None = None
+        self._config = config
+        self._relocalisation = relocalisation
+        self._path = path
+
+    def verdict(
+        self,
+        stamp_ns: int,
+        region: Region,
+        rays: Rays,
+        alignment: Alignment,
+        prior: PosePrior,
+        witness: Witness,
+    ) -> Verdict:
+        """Whether an alignment may be trusted, or odometry in its place."""
+        limits, path = self._config, self._path
+        if not np.isfinite(alignment.T_map_camera).all():
+            return Verdict(trusted=False, reason="the pose is not finite")
+        if alignment.observed_ratio < limits.min_observed_ratio:
+            # Beyond what is mapped only odometry knows; without it the map could not grow.
+            return Verdict(
+                trusted=path.followed,
+                reason=f"only {alignment.observed_ratio:.0%} of the view is mapped",
+            )
+        if alignment.inlier_ratio < limits.min_inlier_ratio:
+            share = f"{alignment.inlier_ratio:.0%}"
+            return Verdict(trusted=False, reason=f"only {share} of the points lie on the map")
+        if alignment.residual_m > limits.max_residual_m:
+            distance = f"{alignment.residual_m * 100:.1f} cm"
+            return Verdict(trusted=False, reason=f"points lie {distance} off the map")
+        pose = alignment.T_map_camera
+        objection = path.impossible(stamp_ns, pose) or path.conflict(prior, pose)
+        if objection:
+            return Verdict(trusted=False, reason=objection)
+        if not path.doubted or path.certain(region, rays, alignment):
+            return Verdict(trusted=True, confirmed=True)
+        return self._adrift(region, rays, alignment, witness)
+
+    def _adrift(
+        self, region: Region, rays: Rays, alignment: Alignment, witness: Witness
+    ) -> Verdict:
+        """What is made of an alignment after odometry has failed."""
+        path = self._path
+        known = witness(path.adrift_since) if path.asks() else None
+        if known is not None:
+            distance, angle = motion_between(known, alignment.T_map_camera)
+            limits = self._relocalisation
+            if distance <= limits.agreement_m and angle <= np.deg2rad(limits.agreement_deg):
+                return Verdict(trusted=True, confirmed=True)
+            if not path.drifted(distance, angle):
+                self.refuted_since = path.adrift_since
+                reason = f"the view is known from {distance:.2f} m away"
+                return Verdict(trusted=False, elsewhere=True, reason=reason)
+        unlikely = path.unlikely(region, rays, alignment)
+        if unlikely:
+            return Verdict(trusted=False, reason=unlikely)
+        reason = "odometry has failed, and nothing known before has been seen since"
+        return Verdict(trusted=True, guessed=True, reason=reason)

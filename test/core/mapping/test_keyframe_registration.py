@@ -136,8 +136,7 @@ def test_where_the_camera_is_comes_before_links(monkeypatch):
     before = len(arriving.linked)
     arriving.add(1)
     for _ in range(2):
-        arriving.registration.proceed(0)
+        arriving.registration.proceed()
     assert len(arriving.linked) == before
-    arriving.registration.proceed(1)
-    arriving.registration.proceed(1)
+    arriving.registration.proceed()
     assert len(arriving.linked) > before

@@ -89,8 +89,6 @@ class KeyframeRegistration:
         newest = len(self._keyframes) - 1
         before = self._keyframes.pose(newest)
         done = 0
-        # Until the camera is recognised, the region that it came back to waits.
-        least = least if self._asking is None else 1
         while not (done >= least and self._frames_wait()) and self._step():
             done += 1
         if self._corrections == corrections:

@@ -80,6 +80,8 @@ class Agreement:
     Attributes:
         cells, occupied: observed ones, and those of them that are truly occupied.
         agree, near: share that is right, of all and of those up to 10 cm from a surface.
+        whole: of those that lie on one side of every surface; one that a surface passes through
+            is both.
         free_right, occupied_right: share that is right of the truly free and occupied ones.
     """
 
@@ -87,6 +89,7 @@ class Agreement:
     occupied: int
     agree: float
     near: float
+    whole: float
     free_right: float
     occupied_right: float
 
@@ -102,6 +105,7 @@ class Agreement:
             occupied=int(truly.sum()),
             agree=float(right.mean()),
             near=float(right[np.abs(truth_m) < NEAR_M].mean()),
+            whole=float(right[np.abs(truth_m) > 0.5 * CELL_M].mean()),
             free_right=float(right[~truly].mean()),
             occupied_right=float(right[truly].mean()),
         )
@@ -273,7 +277,8 @@ def summary(results: dict[str, Any]) -> str:
     found, live = Agreement(**results["agreement"]), results["live"]
     return (
         f"occupancy of {found.cells} observed cells of {CELL_M * 100:.0f} cm: "
-        f"{found.agree:.1%} as the simulator has it (target {TARGET_AGREEMENT:.0%}); of the truly "
+        f"{found.agree:.1%} as the simulator has it (target {TARGET_AGREEMENT:.0%}); of those that "
+        f"no surface passes through {found.whole:.1%}; of the truly "
         f"free ones {found.free_right:.1%}, of the {found.occupied} occupied ones "
         f"{found.occupied_right:.1%}; within {NEAR_M * 100:.0f} cm of a surface {found.near:.1%}\n"
         f"while asked, tracking took {live['frames']} frames and dropped {live['frames_dropped']}"

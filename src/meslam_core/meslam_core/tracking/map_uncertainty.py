@@ -32,6 +32,9 @@ COMMON = np.array([0.003, np.deg2rad(0.07)]) ** 2
 # with K poses and L links alone by sqrt(1 - K / L), 0.8 for three links a keyframe. The map pulls
 # at them too; calibrated by benchmarks/covariance.py.
 UNDERSTATED = 1.5**2
+# What a loop of links misses is spread over them: along a chain such parts add up, as if each
+# were about twice as large and on its own.
+OWN_FACTOR = 4.0
 # One link that is far off says little of the others.
 LARGEST = 0.03**2
 # Odometry over the frames between, and two keyframes that only the map ties.
@@ -87,7 +90,7 @@ class MapUncertainty:
         common = total / (np.count_nonzero(registered) + EXPECTED_LINKS)
         self._link = UNDERSTATED * common + COMMON
         factor = np.where(registered, 1.0, ODOMETRY_FACTOR)[:, None]
-        variances = UNDERSTATED * (factor * common + own) + COMMON
+        variances = UNDERSTATED * (factor * common + OWN_FACTOR * own) + COMMON
         self._find_chains(links.ends, variances, keyframes.fixed)
 
     def covariance(self, position: Floats, keyframe: int) -> Floats:

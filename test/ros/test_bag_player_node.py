@@ -43,6 +43,7 @@ from meslam_ros.qos import STREAM, images
 COUNT = 8
 FRAMES = plane_frames(COUNT)
 WAIT_S = 20.0
+STARTING_S = 90.0
 
 
 @pytest.fixture
@@ -260,9 +261,9 @@ def test_playback_holds_for_a_subscriber_that_hangs(client, tmp_path) -> None:
     try:
         received = {int(listener.stdout.readline())}
         listener.send_signal(signal.SIGSTOP)
-        assert client.spin_until(lambda: "waiting for it" in player.output(), WAIT_S)
+        assert client.spin_until(lambda: "waiting for it" in player.output(), STARTING_S)
         listener.send_signal(signal.SIGCONT)
-        assert player.wait(WAIT_S) == 0, player.output()
+        assert player.wait(STARTING_S) == 0, player.output()
         received |= {int(line) for line in listener.communicate(timeout=WAIT_S)[0].split()}
         assert received == {frame.stamp_ns for frame in plane_frames(count)}
     finally:
@@ -363,7 +364,7 @@ def test_truncated_recording_plays_to_the_damage_and_says_so(client, tmp_path) -
         player_arguments({"recording": cut(path, 0.7), "rate": 10.0}),
         log=tmp_path / "player.log",
     )
-    assert client.spin_until(lambda: player.status is not None, 40.0)
+    assert client.spin_until(lambda: player.status is not None, STARTING_S)
     client.spin_until(lambda: False, 0.3)
     assert 0 < len(viewer.color) < 30
     assert "[bag_player_node]" in player.output()
@@ -380,10 +381,10 @@ def test_process_ends_with_the_status_of_the_contract(client, recording, tmp_pat
     missing = NodeProcess(
         "bag_player_node", player_arguments({"recording": "nothing"}), log=tmp_path / "bad.log"
     )
-    assert client.spin_until(lambda: playing.status is not None, 40.0)
+    assert client.spin_until(lambda: playing.status is not None, STARTING_S)
     assert playing.status == 0, playing.output()
     assert viewer.counts == (COUNT,) * 3
     assert "played 8 image pairs" in playing.output()
-    assert missing.wait(20.0) == 2
+    assert missing.wait(STARTING_S) == 2
     assert "nothing" in missing.output()
     assert "Traceback" not in missing.output()

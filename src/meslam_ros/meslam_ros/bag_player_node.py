@@ -5,18 +5,15 @@ from __future__ import annotations
 import sys
 import threading
 import time
-import traceback
 from pathlib import Path
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import SetBool
 
 from meslam_core.camera import T_BODY_OPTICAL
-from meslam_core.errors import MeslamError, RecordingError
+from meslam_core.errors import RecordingError
 from meslam_core.frame import RgbdFrame
 from meslam_core.recordings import open_recording
 from meslam_interfaces.msg import TrackingStatus
@@ -30,11 +27,12 @@ from meslam_ros.conversions import (
     to_stamp,
 )
 from meslam_ros.frame_reader import FrameReader
-from meslam_ros.managed_node import USAGE_ERROR, ManagedNode, run
+from meslam_ros.image_source import ImageSource, StoppedError
+from meslam_ros.managed_node import USAGE_ERROR, run
 from meslam_ros.node_settings import PlayerSettings
 from meslam_ros.parameters import declare_settings
 from meslam_ros.playback_pace import Pace, Progress
-from meslam_ros.qos import STREAM, images
+from meslam_ros.qos import STREAM
 from meslam_ros.transforms import StaticBroadcaster
 
 POLL_S = 0.02
@@ -49,11 +47,7 @@ PROGRESS_S = 5.0
 FIRST_REPORT_S = 1.0
 
 
-class PlaybackStoppedError(Exception):
-    """The node is being stopped."""
-
-
-class BagPlayerNode(ManagedNode):
+class BagPlayerNode(ImageSource):
     """Publishes colour, depth, camera_info, /clock and the camera's static transform."""
 
     def __init__(self, **options: Any) -> None:
@@ -68,13 +62,8 @@ class BagPlayerNode(ManagedNode):
         self._recording = open_recording(Path(settings.recording))
         self._reader = FrameReader(self._recording, settings.start, settings.step, settings.frames)
         self.exit_code = 0
-        profile = images(ReliabilityPolicy.RELIABLE, IMAGE_DEPTH)
-        self._color = self.create_publisher(Image, topics.COLOR, profile)
-        self._depth = self.create_publisher(Image, topics.DEPTH, profile)
-        self._color_info = self.create_publisher(CameraInfo, topics.COLOR_INFO, profile)
-        self._depth_info = self.create_publisher(CameraInfo, topics.DEPTH_INFO, profile)
+        self.open_publishers(IMAGE_DEPTH)
         self._clock_publisher = self.create_publisher(Clock, topics.CLOCK, STREAM)
-        self._publishers_of_images = (self._color, self._depth, self._color_info, self._depth_info)
         self._static = (
             StaticBroadcaster(self, T_BODY_OPTICAL, settings.base_frame, settings.optical_frame)
             if settings.base_frame
@@ -90,13 +79,10 @@ class BagPlayerNode(ManagedNode):
         self._pause = self.create_service(SetBool, topics.PLAYER_PAUSE, self._on_pause)
 
     def activate(self) -> None:
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="player", daemon=True)
-        self._thread.start()
+        self.begin()
 
     def deactivate(self) -> None:
-        self._stopping.set()
-        self._thread.join()
+        self.end()
 
     def cleanup(self) -> None:
         self._recording.close()
@@ -104,26 +90,17 @@ class BagPlayerNode(ManagedNode):
         self.destroy_subscription(self._status)
         if self._static is not None:
             self._static.close()
-        for publisher in (*self._publishers_of_images, self._clock_publisher):
-            self.destroy_publisher(publisher)
+        self.destroy_publisher(self._clock_publisher)
+        self.close_publishers()
 
-    def _run(self) -> None:
-        try:
-            self._wait_for_subscribers()
-            self._play()
-        except PlaybackStoppedError:
-            return
-        except MeslamError as error:
-            self.exit_code = USAGE_ERROR
-            self.get_logger().error(str(error))
-        except Exception:
-            self.exit_code = 1
-            self.get_logger().fatal(traceback.format_exc())
-        self.stop()
+    def send_images(self) -> None:
+        """Play the recording, once or again and again (`ImageSource`)."""
+        self._wait_for_subscribers()
+        self._play()
 
     def _wait_for_subscribers(self) -> None:
         """Wait until all images have their subscribers and no more are coming."""
-        awaited = (self._color, self._depth, self._color_info)
+        awaited = self.image_publishers[:3]
         started = changed = time.monotonic()
         report_s = FIRST_REPORT_S
         seen: list[int] = []
@@ -146,7 +123,7 @@ class BagPlayerNode(ManagedNode):
                 self.get_logger().info(
                     f"waiting up to {timeout_s:.0f} s for {wanted} subscribers each: {have}"
                 )
-            self._wait(POLL_S)
+            self.wait(POLL_S)
 
     def _play(self) -> None:
         while True:
@@ -169,7 +146,7 @@ class BagPlayerNode(ManagedNode):
         pace = Pace()
         progress = Progress(len(self._reader), self._reader.duration_s, PROGRESS_S)
         count, late = 0, False
-        for frame in self._reader.frames(self._wait):
+        for frame in self._reader.frames(self.wait):
             pace.paused(self._wait_while_paused())
             rate = self._settings.rate
             due_s = pace.next(frame.stamp_ns, time.monotonic(), rate)
@@ -190,7 +167,7 @@ class BagPlayerNode(ManagedNode):
         """How long that took [s]."""
         started = time.monotonic()
         while not self._running.is_set():
-            self._wait(POLL_S)
+            self.wait(POLL_S)
         return time.monotonic() - started
 
     def _publish(self, frame: RgbdFrame) -> None:
@@ -198,11 +175,10 @@ class BagPlayerNode(ManagedNode):
         self._tick(frame.stamp_ns)
         self._unacknowledged += 1
         info = camera_to_info(frame.camera, stamp, name)
-        self._color_info.publish(info)
-        self._depth_info.publish(info)
-        self._color.publish(color_message(frame.color, stamp, name))
-        self._depth.publish(
-            depth_message(frame.depth_m, self._settings.depth_encoding, stamp, name)
+        self.publish_pair(
+            info,
+            color_message(frame.color, stamp, name),
+            depth_message(frame.depth_m, self._settings.depth_encoding, stamp, name),
         )
 
     def _tick(self, now_ns: int) -> None:
@@ -222,12 +198,12 @@ class BagPlayerNode(ManagedNode):
         while (left_s := due_s - time.monotonic()) > 0:
             if self._clock_ns:
                 self._tick(stamp_ns - round(left_s * rate * NANOSECONDS))
-            self._wait(min(left_s, CLOCK_PERIOD_S))
+            self.wait(min(left_s, CLOCK_PERIOD_S))
         return late
 
     def _wait_for_subscribers_to_follow(self) -> None:
         """Hold playback while somebody has not taken what can only just be sent again."""
-        pictures = (self._color, self._depth)
+        pictures = self.image_publishers[:2]
         if all(publisher.wait_for_all_acked(Duration()) for publisher in pictures):
             self._unacknowledged = 0
         elif self._unacknowledged >= IMAGE_DEPTH - 1:
@@ -244,7 +220,7 @@ class BagPlayerNode(ManagedNode):
                 if len(under_way) <= allowed:
                     return
                 if self._stopping.is_set():
-                    raise PlaybackStoppedError
+                    raise StoppedError
                 if time.monotonic() > deadline:
                     raise RecordingError(
                         f"no {topics.STATUS} came for the image at "
@@ -262,9 +238,9 @@ class BagPlayerNode(ManagedNode):
     def _wait_for_acknowledgement(self) -> None:
         """Wait until all subscribers have taken all images; tells who has not."""
         deadline = time.monotonic() + self._settings.wait_timeout_s
-        for publisher in self._publishers_of_images:
+        for publisher in self.image_publishers:
             while not publisher.wait_for_all_acked(Duration(seconds=POLL_S)):
-                self._wait(0.0)
+                self.wait(0.0)
                 if time.monotonic() > deadline:
                     self.get_logger().warn(
                         f"{publisher.topic_name}: a subscriber has not taken all images; it has "
@@ -279,10 +255,6 @@ class BagPlayerNode(ManagedNode):
             self._running.set()
         response.success, response.message = True, "paused" if request.data else "playing"
         return response
-
-    def _wait(self, seconds: float) -> None:
-        if self._stopping.wait(seconds):
-            raise PlaybackStoppedError
 
 
 def main() -> None:

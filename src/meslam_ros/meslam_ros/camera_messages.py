@@ -9,7 +9,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
 from meslam_core import se3
-from meslam_core.camera import T_BODY_OPTICAL, PinholeCamera
+from meslam_core.camera import T_BODY_OPTICAL
+from meslam_core.recordings.playback import pinhole
 from meslam_ros.conversions import camera_to_info, image_message, to_stamp, to_transform
 from meslam_ros.realsense_camera import CameraImages
 
@@ -58,14 +59,7 @@ class CameraMessages:
 
     def __init__(self, frames: CameraFrames, intrinsics: Any) -> None:
         self._frame_id = frames.color_optical
-        self._camera = PinholeCamera(
-            intrinsics.width,
-            intrinsics.height,
-            intrinsics.fx,
-            intrinsics.fy,
-            intrinsics.ppx,
-            intrinsics.ppy,
-        )
+        self._camera = pinhole(intrinsics)
         # As realsense2_camera: the inverse Brown-Conrady model of a D400 is passed off as plumb
         # bob; its coefficients are zero or nearly so.
         fisheye = intrinsics.model.name == "kannala_brandt4"

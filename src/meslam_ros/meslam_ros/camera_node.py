@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
-import traceback
 from typing import Any
 
-from rclpy.qos import ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
-from meslam_core.errors import MeslamError
 from meslam_ros import topics
 from meslam_ros.camera_messages import CameraFrames, CameraMessages
 from meslam_ros.conversions import NANOSECONDS
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, ERROR, OK, WARN, Diagnostics
-from meslam_ros.managed_node import USAGE_ERROR, ManagedNode, run
+from meslam_ros.image_source import ImageSource
+from meslam_ros.managed_node import USAGE_ERROR, run
 from meslam_ros.node_settings import CameraSettings
 from meslam_ros.parameters import declare_settings
-from meslam_ros.qos import images, latched
+from meslam_ros.qos import latched
 from meslam_ros.realsense_camera import (
     CameraImages,
     CameraLostError,
@@ -34,17 +30,14 @@ from meslam_ros.realsense_camera import (
 from meslam_ros.rgbd_input import STEADY
 
 POLL_S = 0.2
+IMAGE_DEPTH = 10
 RETRY_S = 1.0
 FIRST_REPORT_S = 2.0
 LATE_SHARE = 0.8
 WARNING_PERIOD_S = 5.0
 
 
-class StoppedError(Exception):
-    """The node is being stopped."""
-
-
-class CameraNode(ManagedNode):
+class CameraNode(ImageSource):
     """Publishes colour, aligned depth, their camera_infos and the camera's frames.
 
     Args:
@@ -64,63 +57,41 @@ class CameraNode(ManagedNode):
         self._frames = CameraFrames(self._settings.camera_name)
         self._found = self._devices or usb_devices()
         self.exit_code = 0
-        profile = images(ReliabilityPolicy.RELIABLE)
-        self._color = self.create_publisher(Image, topics.COLOR, profile)
-        self._depth = self.create_publisher(Image, topics.DEPTH, profile)
-        self._color_info = self.create_publisher(CameraInfo, topics.COLOR_INFO, profile)
-        self._depth_info = self.create_publisher(CameraInfo, topics.DEPTH_INFO, profile)
+        self.open_publishers(IMAGE_DEPTH)
         self._static = self.create_publisher(TFMessage, topics.TF_STATIC, latched())
         self._diagnostics = Diagnostics(self)
 
     def activate(self) -> None:
-        self._stopping = threading.Event()
         self._camera: RealsenseCamera | None = None
         self._published = self._missed = self._reconnections = 0
         self._reported = (0, time.monotonic())
         self._last_ns = self._last_number = 0
         self._last_s = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
-        self._thread.start()
+        self.begin()
         self._timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY)
 
     def deactivate(self) -> None:
         self.destroy_timer(self._timer)
-        self._stopping.set()
-        self._thread.join()
+        self.end()
 
     def cleanup(self) -> None:
         self._diagnostics.close()
-        for publisher in (
-            self._color,
-            self._depth,
-            self._color_info,
-            self._depth_info,
-            self._static,
-        ):
-            self.destroy_publisher(publisher)
+        self.destroy_publisher(self._static)
+        self.close_publishers()
 
-    def _run(self) -> None:
-        try:
-            while True:
-                device = self._wait_for_device()
-                try:
-                    with RealsenseCamera(device, self._settings) as camera:
-                        self._stream(camera)
-                except CameraLostError as error:
-                    self.get_logger().warn(f"{error}", throttle_duration_sec=WARNING_PERIOD_S)
-                finally:
-                    self._camera = None
-                self._reconnections += 1
-                self._wait(RETRY_S)
-        except StoppedError:
-            return
-        except MeslamError as error:
-            self.exit_code = USAGE_ERROR
-            self.get_logger().error(str(error))
-        except Exception:
-            self.exit_code = 1
-            self.get_logger().fatal(traceback.format_exc())
-        self.stop()
+    def send_images(self) -> None:
+        """Stream from the camera whenever it is there (`ImageSource`)."""
+        while True:
+            device = self._wait_for_device()
+            try:
+                with RealsenseCamera(device, self._settings) as camera:
+                    self._stream(camera)
+            except CameraLostError as error:
+                self.get_logger().warn(str(error), throttle_duration_sec=WARNING_PERIOD_S)
+            finally:
+                self._camera = None
+            self._reconnections += 1
+            self.wait(RETRY_S)
 
     def _wait_for_device(self) -> Any:
         """The camera, as soon as it is plugged in; says more and more seldom that it is not."""
@@ -131,7 +102,7 @@ class CameraNode(ManagedNode):
             if waited_s >= report_s:
                 report_s = 2.0 * waited_s
                 self.get_logger().warn(f"{self._missing()}; looking for it for {waited_s:.0f} s")
-            self._wait(POLL_S)
+            self.wait(POLL_S)
         return device
 
     def _missing(self) -> str:
@@ -165,8 +136,7 @@ class CameraNode(ManagedNode):
         self._last_number = 0
         last_s = time.monotonic()
         while True:
-            if self._stopping.is_set():
-                raise StoppedError
+            self.wait(0.0)
             camera.follow_settings()
             pair = camera.wait(POLL_S)
             now = time.monotonic()
@@ -187,11 +157,7 @@ class CameraNode(ManagedNode):
         if not self._is_later(pair.stamp_ns):
             self._missed += 1
             return
-        info = messages.info(pair)
-        self._color_info.publish(info)
-        self._depth_info.publish(info)
-        self._color.publish(messages.color(pair))
-        self._depth.publish(messages.depth(pair))
+        self.publish_pair(messages.info(pair), messages.color(pair), messages.depth(pair))
         self._published += 1
 
     def _is_later(self, stamp_ns: int) -> bool:
@@ -233,10 +199,6 @@ class CameraNode(ManagedNode):
                 "reconnections": self._reconnections,
             },
         )
-
-    def _wait(self, seconds: float) -> None:
-        if self._stopping.wait(seconds):
-            raise StoppedError
 
 
 def main() -> None:

@@ -221,9 +221,9 @@ def _stream_image(stream: str, frame: Any, wanted: Callable[[str, int], bool]) -
     return StreamImage(stream, stamp_ns, pixels, {"y8": "mono8"}.get(name, name), 0.0)
 
 
-def _camera(profile: Any) -> tuple[PinholeCamera, Lens]:
-    intrinsics = profile.as_video_stream_profile().get_intrinsics()
-    camera = PinholeCamera(
+def pinhole(intrinsics: Any) -> PinholeCamera:
+    """The camera that librealsense's intrinsics mean, its lens left aside."""
+    return PinholeCamera(
         intrinsics.width,
         intrinsics.height,
         intrinsics.fx,
@@ -231,6 +231,11 @@ def _camera(profile: Any) -> tuple[PinholeCamera, Lens]:
         intrinsics.ppx,
         intrinsics.ppy,
     )
+
+
+def _camera(profile: Any) -> tuple[PinholeCamera, Lens]:
+    intrinsics = profile.as_video_stream_profile().get_intrinsics()
+    camera = pinhole(intrinsics)
     model = _LENS_MODELS.get(intrinsics.model.name, intrinsics.model.name)
     return camera, Lens(camera, model, intrinsics.coeffs)
 

@@ -73,7 +73,7 @@ class Outcome:
     def within(self, seconds: float) -> bool:
         """Whether the camera was found in so short a time, where it is."""
         soon = self.found_s is not None and self.found_s <= seconds
-        return soon and self.error_m <= FOUND_M and self.error_rad <= FOUND_RAD
+        return bool(soon and self.error_m <= FOUND_M and self.error_rad <= FOUND_RAD)
 
 
 class Disturbed:

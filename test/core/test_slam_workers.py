@@ -56,7 +56,7 @@ def steps_of(slam: Slam, offered) -> list[int]:
     for frame, odometry in offered:
         slam.process(frame, odometry)
         slam.wait()
-        taken.append(slam._training.latest.losses.steps)
+        taken.append(slam._mapper.wait().losses.steps)
     return taken
 
 
@@ -129,9 +129,8 @@ def test_waiting_for_training_or_not_changes_nothing(config, offered):
         slam = Slam(config)
         for pair in offered:
             slam.track(*pair)
-            training = slam._training and slam._training._worker._running
-            if wait and training is not None:
-                training.result()
+            if wait:
+                slam._mapper.pause()
             slam.map()
         slam.wait()
         return slam.online_trajectory().poses

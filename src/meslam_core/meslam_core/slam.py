@@ -13,33 +13,23 @@ from numpy.typing import NDArray
 from meslam_core.camera import T_BODY_OPTICAL
 from meslam_core.config import MappingConfig, MeslamConfig
 from meslam_core.continuation import Continuation
-from meslam_core.field import field_device, make_field
 from meslam_core.frame import RgbdFrame
 from meslam_core.frame_result import FrameResult, TrackingState
 from meslam_core.loop.recognition import RegionRecogniser
-from meslam_core.mapping.frame_training import FrameTraining
 from meslam_core.mapping.joint_optimizer import JointOptimizer
-from meslam_core.mapping.keyframe_chain import KeyframeChain
-from meslam_core.mapping.keyframe_policy import KeyframePolicy
-from meslam_core.mapping.keyframe_registration import NewKeyframe
-from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
-from meslam_core.mapping.refinement import REFINING_STEPS, Refinement
-from meslam_core.mapping.training_worker import Training
+from meslam_core.mapping.keyframes import KeyframeStore, Rays
+from meslam_core.mapping.mapper import Mapper, SampledFrame
 from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.atlas import RegionAtlas
-from meslam_core.regions.observed_mask import ObservedMask
 from meslam_core.regions.region import Region
-from meslam_core.scratch import ScratchFile
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.frame_history import KeyframePoses
 from meslam_core.tracking.frame_tracking import FrameTracking, TrackedPose
-from meslam_core.tracking.map_uncertainty import MapUncertainty
 from meslam_core.tracking.pixels import TrustedPixels, trusted_pixels
 from meslam_core.trajectory import Trajectory
 
 __all__ = ["T_BODY_OPTICAL", "FrameResult", "Slam", "TrackingState"]
 
-CURRENT_FRAME_RAYS = 4096
 MIN_FRAME_PIXELS = 200
 
 
@@ -47,8 +37,7 @@ MIN_FRAME_PIXELS = 200
 class _Pending:
     """A tracked frame that the map has not seen yet."""
 
-    frame: RgbdFrame
-    pixels: TrustedPixels
+    sampled: SampledFrame
     tracked: TrackedPose
     result: FrameResult
     reference: int
@@ -90,37 +79,15 @@ class Slam:
             config = continuation.adapted(config)
             T_map_camera = continuation.T_map_camera
         self.config = config
-        self._trains = continuation is None or continuation.train
-        self.device = field_device(config.field)
-        kept = config.keyframes
-        self._scratch = ScratchFile(config.runtime.work_dir)
-        # One network needs all its keyframes, always.
-        rays_rest = None if config.regions.single else self._scratch
-        self.keyframes = KeyframeStore(kept.rays, self.device, kept.ray_budget, seed, rays_rest)
-        self.optimizer = JointOptimizer(self.keyframes, config.mapping, seed)
-        self._chain = KeyframeChain(self.keyframes)
-        self.policy = KeyframePolicy(config.keyframes, config.field)
         self.tracking = FrameTracking(config.tracking, T_map_camera, config.relocalisation)
         self._history = self.tracking.history
-        self._map_uncertainty = MapUncertainty()
-        self.atlas: RegionAtlas | None = None
-        self._frames_wait = frames_wait
-        self._seed = seed
         self._generator = np.random.default_rng(seed)
         self._T_map_first = T_map_camera
-        self._training: FrameTraining | None = None
-        self._refinement: Refinement | None = None
         self._pending: _Pending | None = None
-        # What tracking sees of the working region while training changes the original.
+        # What tracking sees of the working region.
         self._view: Region | None = None
-        self._viewed_field = make_field(config.field, seed)
-        # Keyframes that stand for an earlier session's.
-        self.remembered = 0
-        if continuation is not None:
-            self._map_into(continuation.atlas(config, self.keyframes, seed, self._scratch))
-            self.remembered = len(self.keyframes)
-            self._look()
-            self._map_uncertainty.update(self.keyframes)
+        self._mapper = Mapper(config, seed, frames_wait, self._see, continuation)
+        self._mapper.look()
 
     def begin_at(self, T_map_camera: Pose) -> None:
         """Say where the first frame is in a stored map; for who learns it after having read that.
@@ -128,15 +95,31 @@ class Slam:
         Args:
             T_map_camera: (4, 4), as in `Continuation`.
         """
-        assert self.atlas is not None, "only a stored map has places to begin at"
         self.tracking = FrameTracking(
             self.config.tracking, T_map_camera, self.config.relocalisation
         )
         self._history = self.tracking.history
-        self.atlas.take_over(
-            self.atlas.grid, list(self.atlas.regions.values()), T_map_camera[:3, 3]
-        )
-        self._look()
+        self._mapper.begin_at(T_map_camera[:3, 3])
+
+    @property
+    def atlas(self) -> RegionAtlas | None:
+        """The regions; None before the first frame."""
+        return self._mapper.atlas
+
+    @property
+    def keyframes(self) -> KeyframeStore:
+        """Of all regions."""
+        return self._mapper.keyframes
+
+    @property
+    def optimizer(self) -> JointOptimizer:
+        """Trains regions and keyframes' poses."""
+        return self._mapper.optimizer
+
+    @property
+    def remembered(self) -> int:
+        """How many keyframes stand for an earlier session's."""
+        return self._mapper.remembered
 
     @property
     def state(self) -> TrackingState:
@@ -147,12 +130,12 @@ class Slam:
     def wants_new_map(self) -> bool:
         """Whether the camera is lost for so long that a new map is to begin, where configured."""
         limit_s = self.config.relocalisation.new_map_after_s
-        return self._trains and 0.0 < limit_s <= self.tracking.searched_s
+        return self._mapper.trains and 0.0 < limit_s <= self.tracking.searched_s
 
     @property
     def recogniser(self) -> RegionRecogniser | None:
         """Asks regions that were come back to, where loops are closed."""
-        return self._training.recogniser if self._training else None
+        return self._mapper.recogniser
 
     def process(self, frame: RgbdFrame, odometry: OdometryEstimate | None = None) -> FrameResult:
         """Track one frame and begin to train the map with it.
@@ -173,9 +156,10 @@ class Slam:
         """
         started = time.perf_counter()
         pixels = TrustedPixels(trusted_pixels(frame.depth_m, self.config.sensor))
+        sampled = SampledFrame(frame, pixels, self._generator)
         enough = len(pixels) >= MIN_FRAME_PIXELS
         if self._view is not None:
-            rays = self._sample(frame, pixels, self.config.tracking.points) if enough else None
+            rays = sampled.rays(self.config.tracking.points) if enough else None
             witness = partial(self._recognised, frame, rays)
             tracked = self.tracking.track(frame.stamp_ns, self._view, rays, odometry, witness)
             if self.tracking.lost:
@@ -202,9 +186,7 @@ class Slam:
         if self._view is not None:
             reference = self._reference(tracked)
             relative = inverse(self._history.keyframe_pose(reference)) @ tracked.T_map_camera
-        self._pending = _Pending(
-            frame, pixels, tracked, result, reference, orthonormalized(relative)
-        )
+        self._pending = _Pending(sampled, tracked, result, reference, orthonormalized(relative))
         return result
 
     def map(self) -> FrameResult:
@@ -212,21 +194,18 @@ class Slam:
         assert self._pending is not None, "track a frame first"
         pending, self._pending = self._pending, None
         result, trusted = pending.result, pending.tracked.trusted
-        trained = self._finish_training()
-        self._chain.pass_by(result.odometry)
-        if self.tracking.lost:
-            self._chain.cut()
+        trained = self._mapper.wait()
+        self._mapper.pass_by(result.odometry, self.tracking.lost)
         is_keyframe = trusted and self.atlas is None
         if is_keyframe:
-            self._start(pending)
-            trained = self._finish_training()
+            self._mapper.begin(pending.sampled, pending.tracked.T_map_camera, result.odometry)
+            trained = self._mapper.wait()
         elif trusted:
             # The keyframe that the pose was found by may have moved since.
             pose = self._history.keyframe_pose(pending.reference) @ pending.T_reference_camera
-            if self._trains:
-                is_keyframe = self._begin_training(pending, orthonormalized(pose))
-            else:
-                self._follow(pose)
+            is_keyframe = self._mapper.train(
+                pending.sampled, orthonormalized(pose), result.odometry
+            )
         if self.atlas is not None:
             self._remember(pending, is_keyframe)
         return replace(
@@ -254,54 +233,28 @@ class Slam:
 
     def wait(self) -> None:
         """Wait until the latest frame is mapped."""
-        self._finish_training()
+        self._mapper.wait()
 
     def refine(self, steps: int, progress: float = 0.0) -> None:
-        """Train on what was seen for `steps` steps, over all regions; keyframe poses follow.
-
-        Args:
-            steps: number of Adam steps.
-            progress: share of the whole refinement that is done, in [0, 1]; the learning rate
-                falls with it, and with it the noise that training leaves in the map.
-        """
-        self._finish_training()
-        if self._refinement is not None:
-            self._refinement.train(steps, progress)
-            self._look()
+        """Train on what was seen for `steps` steps; see `Mapper.refine`."""
+        self._mapper.refine(steps, progress)
 
     @property
     def refining_steps(self) -> int:
         """How many steps a refinement of the whole map takes."""
-        if not self._trains:
-            return 0
-        refinement = self._refinement
-        return refinement.steps if refinement else self.config.mapping.final_iterations
+        return self._mapper.refining_steps
 
     def change_steps(self, mapping: MappingConfig) -> None:
         """From the next training on take the numbers of steps from another configuration."""
-        changed = replace(
-            self.config.mapping,
-            iterations=mapping.iterations,
-            min_iterations=mapping.min_iterations,
-            keyframe_iterations=mapping.keyframe_iterations,
-            final_iterations=mapping.final_iterations,
-        )
-        self.config = replace(self.config, mapping=changed)
-        self.optimizer.config = changed
+        self._mapper.change_steps(mapping)
 
     def finish(self) -> None:
         """Refine once more over everything seen; then mark the observed space anew."""
-        total = self.refining_steps
-        for done in range(0, total, REFINING_STEPS):
-            self.refine(min(REFINING_STEPS, total - done), done / total)
-        self.settle()
+        self._mapper.finish()
 
     def settle(self) -> None:
         """Mark the observed space anew where the refined keyframes saw it."""
-        self._finish_training()
-        if self._refinement is not None and self._trains:
-            self._refinement.rebuild_masks()
-            self._look()
+        self._mapper.settle()
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every tracked frame as it is known now."""
@@ -315,36 +268,36 @@ class Slam:
         """T_map_camera of every frame as it was known when the frame was done."""
         return self._history.online_trajectory()
 
+    def _see(self, view: Region) -> None:
+        """From now on track in this view of the map."""
+        self._view = view
+        self._history.keyframes = KeyframePoses(self.keyframes)
+
     def _recognised(self, frame: RgbdFrame, rays: Rays | None, before: int | None) -> Pose | None:
         """Where keyframes before a number show that a frame was taken; None where they do not."""
-        assert self._training is not None
         if rays is None:
             return None
         # The images of keyframes belong to the training that runs.
-        self._training.settle()
-        sighting = self._training.relocaliser.recognise(frame, rays, before)
+        self._mapper.pause()
+        sighting = self._mapper.relocaliser.recognise(frame, rays, before)
         return None if sighting is None else sighting.alignment.T_map_camera
 
     def _sought(
         self, frame: RgbdFrame, rays: Rays | None, odometry: OdometryEstimate | None
     ) -> TrackedPose | None:
         """Look for a lost camera in the whole map; None where it is as lost as it was."""
-        assert self._training is not None
-        assert self.atlas is not None
         if rays is None:
             self.tracking.go_blind()
             return None
         # It looks into regions and keyframes, which belong to the training that runs.
-        self._finish_training()
+        self._mapper.wait()
         refuted = self.tracking.take_refuted()
         if refuted is not None:
-            self._training.relocaliser.forget(refuted)
-            self.atlas.discard(refuted)
-        sighting = self._training.relocaliser.find(frame, rays, self.tracking.believed)
+            self._mapper.discard(refuted)
+        sighting = self._mapper.relocaliser.find(frame, rays, self.tracking.believed)
         tracked = self.tracking.recover(frame.stamp_ns, sighting, odometry)
         if sighting is not None and tracked is not None and tracked.trusted:
-            self.atlas.enter(sighting.region)
-            self._look()
+            self._mapper.enter(sighting.region)
         return tracked
 
     def _reference(self, tracked: TrackedPose) -> int:
@@ -355,84 +308,5 @@ class Slam:
         """Covariance (6, 6) of a pose: its place in the map, and the map's own error."""
         if self._view is None:
             return tracked.covariance
-        place = self._map_uncertainty.covariance(
-            tracked.T_map_camera[:3, 3], self._reference(tracked)
-        )
+        place = self._mapper.covariance(tracked.T_map_camera, self._reference(tracked))
         return tracked.covariance + place
-
-    def _sample(self, frame: RgbdFrame, pixels: TrustedPixels, count: int) -> Rays:
-        return rays_at(frame, *pixels.choose(count, self._generator))
-
-    def _finish_training(self) -> Training:
-        """Wait for the training that runs, and let tracking see what it did."""
-        if self._training is None:
-            return Training()
-        if self._training.wait():
-            self._look()
-            self._map_uncertainty.update(self.keyframes)
-        return self._training.latest
-
-    def _look(self) -> None:
-        """Let tracking see the map as it is now; no training runs."""
-        if self.atlas is None:
-            return
-        working = self.atlas.working
-        self._viewed_field.load_flat(working.field.flat())
-        mask = working.mask
-        if working.unmarked:
-            # Training is going to change the mask.
-            mask = ObservedMask.from_flags(mask.flags.copy(), mask.voxel_m)
-        self._view = working.viewed(self._viewed_field, mask)
-        self._history.keyframes = KeyframePoses(self.keyframes)
-
-    def _begin_training(self, pending: _Pending, pose: Pose) -> bool:
-        """Update regions and keyframes for a tracked frame and train; whether it is a keyframe."""
-        assert self.atlas is not None
-        assert self._training is not None
-        frame, pixels = pending.frame, pending.pixels
-        self.atlas.update(pose[:3, 3])
-        is_keyframe = self.policy.is_keyframe(
-            self.atlas.working,
-            self.keyframes,
-            len(self.keyframes) - 1,
-            frame.camera,
-            pose,
-            self._sample(frame, pixels, self.policy.PIXELS),
-        )
-        keyframe = self._add_keyframe(pending, pose) if is_keyframe else None
-        current = self._sample(frame, pixels, CURRENT_FRAME_RAYS)
-        self._look()
-        self._training.start(current, pose, keyframe)
-        return is_keyframe
-
-    def _follow(self, pose: Pose) -> None:
-        """Track in the region that the camera is in; nothing is trained."""
-        assert self.atlas is not None
-        if self.atlas.follow(pose[:3, 3]):
-            self._look()
-
-    def _start(self, pending: _Pending) -> None:
-        """The first frame defines the map frame and trains the first region from nothing."""
-        pose = pending.tracked.T_map_camera
-        training = self._map_into(
-            RegionAtlas(self.config, pose[:3, 3], self.keyframes, self._seed, self._scratch)
-        )
-        self._add_keyframe(pending, pose)
-        training.start_first()
-
-    def _map_into(self, atlas: RegionAtlas) -> FrameTraining:
-        """From now on these regions are trained and refined."""
-        self.atlas = atlas
-        self._refinement = Refinement(atlas, self.optimizer)
-        self._training = FrameTraining(
-            self.config, atlas, self.optimizer, self._scratch, self._frames_wait
-        )
-        return self._training
-
-    def _add_keyframe(self, pending: _Pending, pose: Pose) -> NewKeyframe:
-        assert self.atlas is not None
-        frame = pending.frame
-        rays = self._sample(frame, pending.pixels, self.config.keyframes.rays)
-        number = self._chain.add(frame.stamp_ns, pose, rays, pending.result.odometry)
-        self.atlas.add_keyframe(number)
-        return number, frame, rays

@@ -21,6 +21,7 @@ from meslam_core.errors import MeslamError
 from meslam_ros.client import MeslamClient
 
 DISCOVERY_S = 10.0
+SETTLING_S = 2.0
 SHOWN_ENTRIES = 10
 REFUSED, USAGE_ERROR = 1, 2
 
@@ -130,7 +131,9 @@ def run(arguments: Sequence[str], show: Callable[[str], object] = print) -> int:
     with MeslamClient("call_service") as client:
         try:
             if given.name is None:
-                client.spin_until(lambda: False, 2.0)
+                client.spin_until(lambda: bool(services(client)), DISCOVERY_S)
+                # One node's services may be known before another's.
+                client.spin_until(lambda: False, SETTLING_S)
                 for name, kind in sorted(services(client).items()):
                     show(f"{name}  {kind}")
                 return 0

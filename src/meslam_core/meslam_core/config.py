@@ -1,6 +1,7 @@
 """All numbers of the system: defaults, units, ranges and meanings stand here and nowhere else.
 
-The sections are declared in `tracking_config` and `mapping_config`. The YAML parameter files, the ROS parameter descriptors and `docs/parameters.md` are generated
+The sections are declared in `tracking_config` and `mapping_config`. The YAML parameter files,
+the ROS parameter descriptors and `docs/parameters.md` are generated
 from these classes (`meslam_core.config_reference`).
 """
 

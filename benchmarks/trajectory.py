@@ -17,10 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
-import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +25,15 @@ import numpy as np
 from machine import machine, machine_line
 from peers import pose_graph_slam, tsdf_slam
 from rich.console import Console
+from slam_run import Sequence, SlamRun
 from trajectory_figures import Path3d, plot, spread, table_of
 
-from meslam_core.errors import EvaluationError
 from meslam_core.evaluation.trajectory_error import (
     AbsoluteError,
-    absolute_error,
     frame_jitter_m,
     relative_error_by_frames,
 )
-from meslam_core.recordings import open_recording
-from meslam_core.results import ONLINE_TRAJECTORY, REPORT, TRAJECTORY
-from meslam_core.trajectory import Trajectory, read_tum
+from meslam_core.trajectory import read_tum
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE.parent / "docs" / "benchmarks"
@@ -51,8 +45,12 @@ METHODS = {
     "tsdf": "TSDF SLAM (Open3D)",
     "pose_graph": "pose graph (Open3D, GTSAM)",
 }
-# The peers may have settings of their own for a camera; MeSLAM has the same for all.
-SETTINGS = {"tsdf": tsdf_slam.SETTINGS, "pose_graph": pose_graph_slam.SETTINGS}
+# True poses by recording.
+RECORDINGS = {
+    "tum_fr1_xyz": "groundtruth.txt",
+    "livingroom": "reference_poses.txt",
+    "d435_desk": "t265_poses.txt",
+}
 TRIED = {"tsdf": tsdf_slam.TRIED, "pose_graph": pose_graph_slam.TRIED}
 FIGURES = (
     "frames_tracked",
@@ -65,121 +63,37 @@ FIGURES = (
 )
 
 
-@dataclass(frozen=True)
-class Sequence:
-    """A recording in the folder MESLAM_DATA.
-
-    Attributes:
-        truth: file of true poses in it.
-        lever_arm: the true poses are another sensor's on the same mount; its place is fitted.
-    """
-
-    truth: str
-    lever_arm: bool = False
+def sequences(data: Path) -> dict[str, Sequence]:
+    """The recordings in the folder MESLAM_DATA, by name."""
+    return {
+        name: Sequence(name, data / name, data / name / truth, lever_arm=name == "d435_desk")
+        for name, truth in RECORDINGS.items()
+    }
 
 
-SEQUENCES = {
-    "tum_fr1_xyz": Sequence("groundtruth.txt"),
-    "livingroom": Sequence("reference_poses.txt"),
-    "d435_desk": Sequence("t265_poses.txt", lever_arm=True),
-}
+def out_of(recording: str, method: str, seed: int, options: argparse.Namespace) -> Path:
+    """Folder of a run's results."""
+    frames = options.frames.replace(":", "-")
+    return CACHE / recording / frames / f"{method}_{seed}_{options.cores}cores"
 
 
-@dataclass(frozen=True)
-class Job:
-    """One run of one method.
-
-    Attributes:
-        recording: name of the sequence.
-        method: key of METHODS.
-        seed: of MeSLAM; the number of the repetition for the others.
-        frames: `A:B:STEP`.
-        cores: that may be used.
-    """
-
-    recording: str
-    method: str
-    seed: int
-    frames: str
-    cores: int
-
-    @property
-    def out(self) -> Path:
-        """Folder of the results."""
-        frames = self.frames.replace(":", "-")
-        return CACHE / self.recording / frames / f"{self.method}_{self.seed}_{self.cores}cores"
-
-    @property
-    def chosen(self) -> slice:
-        """The frames."""
-        return slice(*(int(part) if part else None for part in self.frames.split(":")))
-
-    def command(self, data: Path) -> list[str]:
-        """What runs it, in the folder of this file."""
-        common = [str(data / self.recording), "--out", str(self.out), "--frames", self.frames]
-        if self.method == "meslam":
-            program = shutil.which("meslam", path=Path(sys.executable).parent) or "meslam"
-            truth = str(data / self.recording / SEQUENCES[self.recording].truth)
-            lever_arm = ["--lever-arm"] if SEQUENCES[self.recording].lever_arm else []
-            seed = ["--seed", str(self.seed)]
-            return [program, "run", *common, "--truth", truth, *lever_arm, *seed]
-        best = SETTINGS[self.method].get(self.recording, ())
-        settings = [word for setting in best for word in ("--set", setting)]
-        return [sys.executable, "-m", "peers", self.method, *common, *settings]
-
-
-def run(job: Job, data: Path) -> None:
-    """Run a job in a process of its own, on its share of the cores."""
-    shutil.rmtree(job.out, ignore_errors=True)
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    environment = dict(os.environ)
-    # MeSLAM divides its cores itself.
-    environment.pop("OMP_NUM_THREADS", None)
-    if job.method != "meslam":
-        environment["OMP_NUM_THREADS"] = str(job.cores)
-
-    def confine() -> None:
-        if hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: job.cores])
-
-    subprocess.run(job.command(data), cwd=HERE, env=environment, check=True, preexec_fn=confine)
-
-
-def held(trajectory: Trajectory, stamps_ns: np.ndarray) -> Trajectory:
-    """Poses at all stamps of the frames; one that was not tracked has the last pose before it."""
-    last = np.searchsorted(trajectory.stamps_ns, stamps_ns, side="right") - 1
-    return Trajectory(stamps_ns, trajectory.poses[np.maximum(last, 0)])
-
-
-def error_of(trajectory: Trajectory, truth: Trajectory, sequence: Sequence) -> AbsoluteError:
-    """ATE; without a lever arm where the trajectory turns too little to tell it (lost early)."""
-    try:
-        return absolute_error(trajectory, truth, hand_eye=sequence.lever_arm)
-    except EvaluationError:
-        return absolute_error(trajectory, truth)
-
-
-def evaluated(job: Job, data: Path) -> tuple[dict[str, Any], AbsoluteError]:
+def evaluated(job: SlamRun) -> tuple[dict[str, Any], AbsoluteError]:
     """Figures of a finished run, and the error of its refined trajectory."""
-    sequence = SEQUENCES[job.recording]
-    truth = read_tum(data / job.recording / sequence.truth)
-    recording = open_recording(data / job.recording)
-    stamps_ns = np.asarray(recording.stamps_ns)[job.chosen]
-    recording.close()
-    report = json.loads((job.out / REPORT).read_text())
-    refined = read_tum(job.out / TRAJECTORY)
-    online = read_tum(job.out / ONLINE_TRAJECTORY)
-    absolute = error_of(held(refined, stamps_ns), truth, sequence)
-    live = error_of(held(online, stamps_ns), truth, sequence)
+    sequence = job.sequence
+    truth = read_tum(sequence.truth)
+    refined, online = job.trajectory(), job.trajectory(online=True)
+    absolute = sequence.error_of(job.of_all_frames())
+    live = sequence.error_of(job.of_all_frames(online=True))
     mounting = live.mounting
     tracked = online.transformed(mounting.T_truth_map, mounting.T_camera_sensor)
+    report = job.report
     return {
         "seed": job.seed,
-        "frames": len(stamps_ns),
+        "frames": len(job.stamps_ns),
         "frames_tracked": len(online),
         "ate_m": absolute.rmse_m,
         "ate_online_m": live.rmse_m,
-        "ate_tracked_m": error_of(refined, truth, sequence).rmse_m,
+        "ate_tracked_m": sequence.error_of(refined).rmse_m,
         "jitter_rms_m": frame_jitter_m(tracked, truth),
         "jitter_median_m": float(
             np.median(relative_error_by_frames(tracked, truth).translations_m)
@@ -192,15 +106,16 @@ def evaluated(job: Job, data: Path) -> tuple[dict[str, Any], AbsoluteError]:
 
 
 def collect(
-    jobs: list[Job], data: Path
+    jobs: list[SlamRun],
 ) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Path3d]]]:
     """Figures of all finished runs by recording and method, and the path of each median run."""
     summary: dict[str, dict[str, Any]] = {}
     paths: dict[str, dict[str, Path3d]] = {}
-    for recording in dict.fromkeys(job.recording for job in jobs):
+    for recording in dict.fromkeys(job.sequence.name for job in jobs):
         for method in dict.fromkeys(job.method for job in jobs):
-            chosen = [job for job in jobs if (job.recording, job.method) == (recording, method)]
-            results = [evaluated(job, data) for job in chosen if (job.out / REPORT).exists()]
+            wanted = recording, method
+            chosen = [job for job in jobs if (job.sequence.name, job.method) == wanted]
+            results = [evaluated(job) for job in chosen if job.done]
             if not results:
                 continue
             runs = [figures for figures, _ in results]
@@ -248,7 +163,7 @@ def write(
 
 def parsed_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--recordings", nargs="+", choices=SEQUENCES, default=list(SEQUENCES))
+    parser.add_argument("--recordings", nargs="+", choices=RECORDINGS, default=list(RECORDINGS))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--again", nargs="+", choices=METHODS, default=[], help="run these anew")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each method")
@@ -267,18 +182,25 @@ def main() -> None:
     options = parsed_options()
     if "MESLAM_DATA" not in os.environ:
         sys.exit("MESLAM_DATA must name the folder of the recordings")
-    data = Path(os.environ["MESLAM_DATA"]).resolve()
+    known = sequences(Path(os.environ["MESLAM_DATA"]).resolve())
     jobs = [
-        Job(recording, method, seed, options.frames, options.cores)
+        SlamRun(
+            known[recording],
+            method,
+            seed,
+            options.frames,
+            options.cores,
+            out_of(recording, method, seed, options),
+        )
         for seed in range(options.seeds)
         for recording in options.recordings
         for method in options.methods
     ]
     for number, job in enumerate(jobs, start=1):
-        if job.method in options.again or not (job.out / REPORT).exists():
-            print(f"{number}/{len(jobs)}: {job.recording}, {job.method}, seed {job.seed}")
-            run(job, data)
-    write(*collect(jobs, data), options)
+        if job.method in options.again or not job.done:
+            print(f"{number}/{len(jobs)}: {job.sequence.name}, {job.method}, seed {job.seed}")
+            job.run()
+    write(*collect(jobs), options)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from peers.pose_graph_slam import PoseGraphSlam, PoseGraphSlamConfig
 from peers.reduction import reduced
 from peers.rgbd_registration import Registration
 from peers.tsdf_slam import TsdfSlam, TsdfSlamConfig
-from trajectory import held
+from slam_run import held
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.evaluation.trajectory_error import absolute_error

@@ -45,7 +45,7 @@ def covered(frame):
 
 def test_everything_of_the_contract_is_written(finished_run, room_frames):
     names = {file.name for file in finished_run.out.iterdir()}
-    texts = {"trajectory.txt", "trajectory_online.txt", "covariance_online.txt"}
+    texts = {"trajectory.txt", "trajectory_online.txt", "covariance_online.txt", "frames.csv"}
     assert names == texts | {"map.meslam", "report.json"}
     stamps = [frame.stamp_ns for frame in room_frames]
     covariances = read_covariances(finished_run.out / "covariance_online.txt")

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import logging
 import re
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -175,6 +177,7 @@ def run(
         odometry=odometry,
         continuation=read_continuation(stored, start_pose),
         seed=seed,
+        command=shlex.join(["meslam", *sys.argv[1:]]),
     )
     source = open_recording(recording, intrinsics)
     try:

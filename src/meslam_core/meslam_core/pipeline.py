@@ -14,6 +14,8 @@ from meslam_core.continuation import Continuation
 from meslam_core.errors import EvaluationError, FrameError, RecordingError
 from meslam_core.evaluation.covariance import covariance_entries
 from meslam_core.evaluation.report import truth_entries
+from meslam_core.frame_log import FRAMES
+from meslam_core.frame_recorder import FrameRecorder
 from meslam_core.interruption import stop_request
 from meslam_core.odometry import GivenOdometry, make_odometry
 from meslam_core.odometry_worker import OdometryWorker
@@ -71,6 +73,7 @@ class RunOptions:
             built-in odometry.
         continuation: a stored map to go on with.
         seed: of every random choice.
+        command: that asked for the run, for the report.
     """
 
     frames: slice = field(default_factory=lambda: slice(None))
@@ -80,6 +83,17 @@ class RunOptions:
     odometry: Path | None = None
     continuation: Continuation | None = None
     seed: int = 0
+    command: str = ""
+
+    def entries(self, recording: Path) -> dict[str, Any]:
+        """What the report says of them, to find again what the run was made of."""
+        return {
+            "recording_path": str(recording.absolute()),
+            "frame_range": [self.frames.start or 0, self.frames.stop, self.frames.step or 1],
+            "truth": None if self.truth is None else str(self.truth.absolute()),
+            "lever_arm": self.hand_eye,
+            "command": self.command or None,
+        }
 
 
 @dataclass(frozen=True)
@@ -111,10 +125,10 @@ def run(
     """Track and map a recording, and write what came of it.
 
     Writes `trajectory.txt` (refined) and `trajectory_online.txt` (TUM format, T_map_camera, one
-    line a tracked frame), `covariance_online.txt` (see `write_covariances`), `map.meslam/` and
-    `report.json` into `out_dir`. A recording that breaks off, or a user who interrupts (SIGINT,
-    SIGTERM), still leaves the results of the frames before; after any other error nothing of this
-    run is left.
+    line a tracked frame), `covariance_online.txt` (see `write_covariances`), `frames.csv` (see
+    `FrameEntry`), `map.meslam/` and `report.json` into `out_dir`. A recording that breaks off, or
+    a user who interrupts (SIGINT, SIGTERM), still leaves the results of the frames before; after
+    any other error nothing of this run is left.
 
     Args:
         recording: open; it is not closed.
@@ -134,8 +148,9 @@ def run(
     truth = None if options.truth is None else read_tum(options.truth)
     odometry = None if options.odometry is None else read_tum(options.odometry)
     with ResultFolder(out_dir) as results:
-        loop = _Loop(recording, config, options, odometry, progress)
-        loop.run()
+        with FrameRecorder(results.incomplete(FRAMES), config.map.codec) as recorder:
+            loop = _Loop(recording, config, options, odometry, progress, recorder)
+            loop.run()
         slam = loop.slam
         progress.stage("writing")
         refined = loop.tally.tracked(slam.trajectory())
@@ -179,6 +194,7 @@ class _Loop:
         options: RunOptions,
         odometry: Trajectory | None,
         progress: RunProgress,
+        recorder: FrameRecorder,
     ) -> None:
         self.tally = Tally()
         self.broke_off = ""
@@ -199,6 +215,7 @@ class _Loop:
         self._options = options
         self._odometry = odometry
         self._progress = progress
+        self._recorder = recorder
 
     def run(self) -> None:
         """Feed the frames, then refine the map unless the user is in a hurry."""
@@ -235,11 +252,14 @@ class _Loop:
         with closing(iter(self._worker)) as ready:
             for timed in ready:
                 self.slam.track(timed.frame, timed.odometry)
+                late_ms = None
                 if paced is not None:
-                    self.tally.lateness_ms.append(paced.lateness_s(timed.frame.stamp_ns) * 1e3)
+                    late_ms = paced.lateness_s(timed.frame.stamp_ns) * 1e3
+                    self.tally.lateness_ms.append(late_ms)
                     self.skipped = paced.skipped
                 result = self.slam.map()
                 self.tally.add(result, timed.reading_ms, timed.odometry_ms)
+                self._recorder.add(self.slam, result, timed, late_ms, self.skipped)
                 self._progress.processed(self.tally.frames + self.skipped, result)
                 if stop.is_set():
                     self.interrupted = True
@@ -263,6 +283,7 @@ class _Loop:
             "broke_off": self.broke_off or None,
             "interrupted": self.interrupted,
             "recording": self._recording.name,
+            **self._options.entries(self._recording.path),
             "camera": self._recording.camera.to_dict(),
             "seed": self._options.seed,
             "realtime": self._options.realtime,

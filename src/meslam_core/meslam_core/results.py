@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any
 
 from meslam_core.errors import OutputError
+from meslam_core.frame_log import FRAMES
 from meslam_core.map.manifest import MANIFEST
 
 TRAJECTORY = "trajectory.txt"
@@ -89,7 +90,7 @@ class ResultFolder:
             OutputError: when they cannot be moved to their places.
         """
         try:
-            for name in (TRAJECTORY, ONLINE_TRAJECTORY, COVARIANCES, MAP, REPORT):
+            for name in (TRAJECTORY, ONLINE_TRAJECTORY, COVARIANCES, FRAMES, MAP, REPORT):
                 target, result = self.path / name, self.incomplete(name)
                 if target.is_dir():
                     shutil.rmtree(target)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import resource
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -130,9 +133,17 @@ def _observed_positions(mask: ObservedMask) -> NDArray[np.float64]:
 
 
 def run_environment() -> dict[str, Any]:
-    """Versions of what computed the results, and the largest memory of the process."""
+    """When, on what and with which versions results were computed; the process's largest memory."""
     return {
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "machine": {
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+            "memory_gb": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9,
+            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+            "system": platform.platform(),
+        },
         "versions": {
             "meslam": meslam_core.__version__,
             "python": platform.python_version(),
@@ -142,6 +153,25 @@ def run_environment() -> dict[str, Any]:
             "open3d": metadata.version("open3d-cpu"),
         },
     }
+
+
+def rss_mb() -> float | None:
+    """Memory that the process holds now; None where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_bytes().split()[1])
+    except (OSError, IndexError, ValueError):
+        return None
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2.0**20
+
+
+def _processor() -> str:
+    """Name of the processor, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def _spread(values: list[float]) -> dict[str, float | None]:

@@ -127,6 +127,11 @@ class Slam:
         return self.tracking.state
 
     @property
+    def working_view(self) -> Region | None:
+        """The working region as tracking sees it, which training leaves alone."""
+        return self._view
+
+    @property
     def wants_new_map(self) -> bool:
         """Whether the camera is lost for so long that a new map is to begin, where configured."""
         limit_s = self.config.relocalisation.new_map_after_s

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 FORMATS = (".ply", ".glb", ".obj")
 
 _PLY_VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)])
+_SRGB = np.arange(256) / 255.0
+_LINEAR = np.rint(
+    65535.0 * np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
+).astype("<u2")
+"""What linear light the 256 values of sRGB stand for (IEC 61966-2-1), as 16 bits."""
 _PLY_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 
 
@@ -45,7 +50,7 @@ def write_mesh(mesh: TriangleMesh, path: str | Path) -> None:
         if suffix == ".ply":
             produce_atomically(path, lambda file: _write_ply(mesh, file))
         elif suffix == ".glb":
-            produce_atomically(path, lambda file: _write_glb(mesh, file))
+            produce_atomically(path, lambda file: write_glb(mesh, file))
         else:
             _write_obj(mesh, path)
     except OSError as error:
@@ -81,20 +86,24 @@ def _write_ply(mesh: TriangleMesh, file: BinaryIO) -> None:
     file.write(faces.tobytes())
 
 
-def _write_glb(mesh: TriangleMesh, file: BinaryIO) -> None:
-    """One mesh in glTF 2.0's binary container; its node turns z up into glTF's y up."""
-    colors = np.full((len(mesh.colors), 4), 255, np.uint8)
-    colors[:, :3] = mesh.colors
+def write_glb(mesh: TriangleMesh, file: BinaryIO) -> None:
+    """One mesh in glTF 2.0's binary container; its node turns z up into glTF's y up.
+
+    Colours are linear there, and of 16 bits so that dark ones stay apart; they hold the light of
+    the scene, so the material is unlit (KHR_materials_unlit).
+    """
+    colors = np.full((len(mesh.colors), 4), 65535, "<u2")
+    colors[:, :3] = _LINEAR[mesh.colors]
     parts = [mesh.triangles.astype("<u4"), mesh.vertices, mesh.normals, colors]
     views, accessors, start = [], [], 0
     for part, component, shape in zip(
-        parts, (5125, 5126, 5126, 5121), ("SCALAR", "VEC3", "VEC3", "VEC4"), strict=True
+        parts, (5125, 5126, 5126, 5123), ("SCALAR", "VEC3", "VEC3", "VEC4"), strict=True
     ):
         views.append({"buffer": 0, "byteOffset": start, "byteLength": part.nbytes})
         count = part.size if shape == "SCALAR" else len(part)
         accessors.append(
             {"bufferView": len(views) - 1, "componentType": component, "count": count}
-            | {"type": shape, "normalized": component == 5121}
+            | {"type": shape, "normalized": component == 5123}
         )
         start += part.nbytes
     accessors[1] |= {
@@ -102,12 +111,18 @@ def _write_glb(mesh: TriangleMesh, file: BinaryIO) -> None:
         "max": mesh.vertices.max(axis=0).tolist(),
     }
     attributes = {"POSITION": 1, "NORMAL": 2, "COLOR_0": 3}
+    material = {
+        "pbrMetallicRoughness": {"metallicFactor": 0.0},
+        "extensions": {"KHR_materials_unlit": {}},
+    }
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "MeSLAM"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "rotation": [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0}]}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
+        "materials": [material],
+        "extensionsUsed": ["KHR_materials_unlit"],
         "buffers": [{"byteLength": start}],
         "bufferViews": views,
         "accessors": accessors,

@@ -1,10 +1,11 @@
 # The words of the README. `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup build test demo lint format typecheck config clean
+.PHONY: help setup build test demo faults lint format typecheck config clean
 
 RECORDING ?=
 PYTEST_ARGS ?=
+FAULTS ?=
 IN_ENV := source env.bash &&
 
 help:  ## show this list
@@ -21,6 +22,9 @@ test: setup  ## run all tests; PYTEST_ARGS="test/core -k name" runs some
 
 demo: setup  ## map a simulated room, or RECORDING=path, with the real nodes; results in out/
 	@$(IN_ENV) python tools/demo.py $(if $(RECORDING),"$(RECORDING)")
+
+faults: setup  ## inject all faults and write docs/reliability.md; FAULTS="input live" injects some
+	@$(IN_ENV) PYTHONPATH="test:$$PYTHONPATH" python -m faults $(FAULTS)
 
 lint: setup  ## check style and formatting
 	@$(IN_ENV) ruff check . && ruff format --check .

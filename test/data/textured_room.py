@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from meslam_core.camera import PinholeCamera
+from meslam_core.camera import T_BODY_OPTICAL, PinholeCamera
 from meslam_core.frame import RgbdFrame
 from meslam_core.se3 import Pose, exp
-from meslam_core.slam import T_BODY_OPTICAL
 
 CAMERA = PinholeCamera(width=160, height=120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
 ROOM_LOW, ROOM_HIGH = np.array([-0.7, -1.3, -0.9]), np.array([2.1, 1.3, 1.1])

@@ -38,6 +38,14 @@ def machine_line(described: dict[str, Any]) -> str:
     return f"{described['cpu']}, {described['cores']} cores ({sets}); {versions}"
 
 
+def busy_core_s() -> float:
+    """What all cores together have computed for anybody since the machine started [s]."""
+    ticks = Path("/proc/stat").read_text().splitlines()[0].split()[1:]
+    user, nice, system, _, _, irq, softirq, *rest = map(int, ticks)
+    stolen = rest[0] if rest else 0
+    return (user + nice + system + irq + softirq + stolen) / os.sysconf("SC_CLK_TCK")
+
+
 def memory_mb(pid: int) -> tuple[float, float]:
     """Resident set of a process now and at its largest [MB], from Linux's /proc."""
     entries = dict(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pytest
 
@@ -54,6 +55,7 @@ def test_a_map_of_an_earlier_run_does_not_stay_beside_new_results(tmp_path):
         fill(results, "no map this time")
         results.publish()
     assert not (tmp_path / "map.meslam").exists()
+    assert (tmp_path / "previous.meslam" / "manifest.json").read_text() == "{}"
 
 
 def test_a_folder_that_is_no_map_is_not_replaced(tmp_path):
@@ -86,3 +88,17 @@ def test_a_report_holds_no_number_that_json_lacks(tmp_path):
     with ResultFolder(tmp_path / "a") as results, pytest.raises(ValueError, match="JSON"):
         results.write_report({"fps": float("nan")})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path):
+    with ResultFolder(tmp_path) as results:
+        fill(results, "mine")
+        with (
+            pytest.raises(OutputError, match=rf"being written by process {os.getpid()} \("),
+            ResultFolder(tmp_path),
+        ):
+            pass
+        results.publish()
+    assert (tmp_path / TRAJECTORY).read_text() == "mine"
+    with ResultFolder(tmp_path):
+        pass

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,3 +29,10 @@ def versions(store: MapStore) -> dict[tuple[int, int, int], int]:
     loaded = store.load()
     assert not loaded.warnings
     return {region.index: region.version for region in loaded.regions}
+
+
+def resealed(document: dict[str, Any]) -> bytes:
+    """A manifest of any content with a checksum that is right."""
+    document["sha256"] = "0" * 64
+    blank = json.dumps(document, indent=1).encode() + b"\n"
+    return blank.replace(b"0" * 64, hashlib.sha256(blank).hexdigest().encode())

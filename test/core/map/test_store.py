@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from data.analytic_scene import GRID
+from data.killed_process import child
 from data.stored_maps import Regions, changed, region_files, versions
 
 from meslam_core.errors import MapError, OutputError
-from meslam_core.map import codec
+from meslam_core.map import codec, lock
+from meslam_core.map.lock import locked
 from meslam_core.map.manifest import Manifest
 from meslam_core.map.store import MapStore
 
@@ -102,15 +104,32 @@ def test_a_manifest_reads_back(saved: MapStore) -> None:
     assert Manifest.from_bytes(data, "manifest.json").to_bytes() == data
 
 
-def test_two_writers(saved: MapStore, two_small_regions: Regions) -> None:
-    descriptor = os.open(saved.path, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        with pytest.raises(OutputError, match="another program"):
+def test_two_writers(
+    saved: MapStore, two_small_regions: Regions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with locked(saved.path):
+        with pytest.raises(OutputError, match=rf"written by process {os.getpid()} \(.*pytest"):
+            saved.save(two_small_regions, GRID)
+        monkeypatch.setattr(lock, "HELD_LOCKS", saved.path / "none")
+        with pytest.raises(OutputError, match="written by another program"):
             saved.save(two_small_regions, GRID)
         assert versions(saved)
-    finally:
-        os.close(descriptor)
+    saved.save(two_small_regions, GRID)
+
+
+def test_the_lock_of_a_killed_writer_is_gone(
+    saved: MapStore, two_small_regions: Regions, tmp_path: Path
+) -> None:
+    def hold_for_ever() -> None:
+        with locked(saved.path):
+            (tmp_path / "held").touch()
+            time.sleep(1000)
+
+    with child(hold_for_ever) as process:
+        while not (tmp_path / "held").exists():
+            time.sleep(0.01)
+        with pytest.raises(OutputError, match=f"process {process} "):
+            saved.save(two_small_regions, GRID)
     saved.save(two_small_regions, GRID)
 
 

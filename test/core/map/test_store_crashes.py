@@ -10,13 +10,13 @@ import resource
 import signal
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from data.analytic_scene import GRID
+from data.killed_process import child, killed_at_call, status_of
 from data.stored_maps import Regions, changed, region_files, versions
 
 from meslam_core.errors import OutputError
@@ -88,30 +88,6 @@ def test_a_failed_first_save_leaves_nothing_behind(
     assert number > 8
 
 
-@contextlib.contextmanager
-def child(work: Callable[[], None]) -> Iterator[int]:
-    """A process of its own that works until it is killed, at the latest on leaving."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of forking with threads
-        process = os.fork()
-    if process == 0:
-        try:
-            work()
-        finally:
-            os._exit(1)
-    try:
-        yield process
-    finally:
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-
-
-def status_of(work: Callable[[], None]) -> int:
-    """With what a process of its own ends, or the signal that ended it."""
-    with child(work) as process:
-        return os.waitid(os.P_PID, process, os.WEXITED | os.WNOWAIT).si_status
-
-
 def contents(store: MapStore) -> set[bytes]:
     """The encoded regions of an undamaged map."""
     loaded = store.load()
@@ -159,23 +135,10 @@ def test_killed_at_every_step_of_a_save(
     for number in range(1, 100):
         saved.save(two_maps[0], GRID)
 
-        def save_and_die(number: int = number) -> None:
-            calls = iter(range(1, 1000))
-
-            def fatal(original: Callable[..., Any]) -> Callable[..., Any]:
-                def call(*arguments: Any, **named: Any) -> Any:
-                    if next(calls) == number:
-                        os.kill(os.getpid(), signal.SIGKILL)
-                    return original(*arguments, **named)
-
-                return call
-
-            for name in ("fsync", "replace", "unlink"):
-                monkeypatch.setattr(os, name, fatal(getattr(os, name)))
+        def save() -> None:
             MapStore(saved.path).save(two_maps[1], GRID)
-            os._exit(0)
 
-        status = status_of(save_and_die)
+        status = killed_at_call(number, save, monkeypatch)
         found.append([set(regions) for regions in two_maps].index(contents(saved)))
         if status == 0:
             break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import random
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from data.analytic_scene import GRID
-from data.stored_maps import Regions, changed, region_files, versions
+from data.stored_maps import Regions, changed, region_files, resealed, versions
 
 from meslam_core.errors import MapError, OutputError
 from meslam_core.map import codec
@@ -117,13 +116,6 @@ def test_rebuilt_lattice_of_a_single_region(tmp_path: Path, small_region: Stored
     store.save([replace(small_region, T_map_region=T_map_region)], grid)
     (store.path / "manifest.json").write_bytes(b"")
     assert np.allclose(store.load().grid.origin, grid.origin)
-
-
-def resealed(document: dict[str, Any]) -> bytes:
-    """A manifest of any content with a checksum that is right."""
-    document["sha256"] = "0" * 64
-    blank = json.dumps(document, indent=1).encode() + b"\n"
-    return blank.replace(b"0" * 64, hashlib.sha256(blank).hexdigest().encode())
 
 
 def test_a_newer_map_is_refused_and_not_overwritten(

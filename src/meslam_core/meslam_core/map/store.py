@@ -8,7 +8,6 @@ So a crash at any instant leaves the previous map or the new one.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import os
 import uuid
@@ -24,6 +23,7 @@ from meslam_core.map.files import (
     sync_folder,
     write_atomically,
 )
+from meslam_core.map.lock import locked
 from meslam_core.map.manifest import (
     MANIFEST,
     Manifest,
@@ -204,14 +204,7 @@ class MapStore:
                 stack.callback(self._remove_unfinished)
                 self.path.mkdir(parents=True)
                 sync_folder(self.path.parent)
-            descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-            stack.callback(os.close, descriptor)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise OutputError(
-                    f"{self.path} is being written by another program; wait until it is done"
-                ) from error
+            stack.enter_context(locked(self.path))
             yield
 
     def _remove_unfinished(self) -> None:

@@ -45,5 +45,8 @@ setup(
         (f"share/{NAME}/config", files_in(*CONFIG_DIRS)),
     ],
     zip_safe=False,
-    entry_points={"console_scripts": [f"{node} = {NAME}.{node}:main" for node in (*NODES, *TOOLS)]},
+    entry_points={
+        "console_scripts": [f"{node} = {NAME}.{node}:main" for node in (*NODES, *TOOLS)],
+        "meslam.doctor": [f"ROS = {NAME}.doctor:examine_ros"],
+    },
 )

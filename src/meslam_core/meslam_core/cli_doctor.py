@@ -29,7 +29,8 @@ def doctor(
     Exit status 1 when something would keep MeSLAM from working.
     """
     from meslam_core.console import error_console
-    from meslam_core.doctor.diagnosis import Status, diagnose, examinations, gravest
+    from meslam_core.doctor import Status
+    from meslam_core.doctor.diagnosis import diagnose, examinations, gravest
 
     with error_console().status("starting") as shown:
         areas = list(diagnose(examinations(out), lambda area: shown.update(f"checking {area}")))

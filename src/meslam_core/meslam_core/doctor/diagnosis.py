@@ -53,7 +53,7 @@ def examinations(folder: Path) -> dict[str, Examination]:
 
 def _added(points: Iterable[metadata.EntryPoint]) -> dict[str, Examination]:
     """What other packages look at; that of ROS is missed where it is not there."""
-    found = {point.name: partial(_loaded, point) for point in points}
+    found: dict[str, Examination] = {point.name: partial(_loaded, point) for point in points}
     return found or {"ROS": lambda: [warn("meslam_ros", "is not on the path", NO_ROS)]}
 
 

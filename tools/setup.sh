@@ -11,6 +11,7 @@
 #                    insists on the wheels
 # MESLAM_JOBS        compilers to run at the same time; by default one a core
 # MESLAM_SKIP_APT=1  the system packages are there, however they came
+# MESLAM_BROWSER=1   install the browser too that the viewer's tests need
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -32,6 +33,7 @@ install_system_packages() {
   [ "${MESLAM_SKIP_APT:-0}" = 1 ] && return
   local wanted missing=() package
   mapfile -t wanted < <(grep -v '^#' tools/apt-packages.txt)
+  [ "${MESLAM_BROWSER:-0}" = 1 ] && wanted+=(chromium)
   if ! command -v dpkg-query >/dev/null || ! command -v apt-get >/dev/null; then
     die "this is no Debian or Ubuntu. Install what these packages bring: ${wanted[*]};
        then run: MESLAM_SKIP_APT=1 make setup"

@@ -65,6 +65,12 @@ def test_while_frames_wait_mapping_takes_the_fewest_steps(config, offered):
     assert steps_of(slam, offered[:4]) == [FIRST_LEAST, LEAST, LEAST, LEAST]
 
 
+def test_a_frame_after_skipped_ones_takes_their_fewest_steps_up_to_all_its_own(config, offered):
+    slam = Slam(config, frames_wait=lambda: True)
+    late = [offered[number] for number in (0, 1, 3, 7)]
+    assert steps_of(slam, late) == [FIRST_LEAST, LEAST, 2 * LEAST, STEPS]
+
+
 def test_the_steps_of_a_result_are_those_that_were_taken(config, offered):
     slam = Slam(config, frames_wait=lambda: True)
     results = [slam.process(*pair) for pair in offered[:4]]

@@ -100,7 +100,7 @@ class MappingConfig:
     )
     min_iterations: int = setting(
         6,
-        "steps a frame even while frames wait to be tracked",
+        "steps a frame even while frames wait to be tracked; after skipped ones also theirs",
         minimum=0,
         maximum=1000,
         live=True,

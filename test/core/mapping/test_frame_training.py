@@ -72,7 +72,7 @@ class Frames:
         pose = POSE.copy()
         pose[: len(spacings), 3] = self.atlas.grid.spacing_m * np.array(spacings)
         self.atlas.update(pose[:3, 3])
-        self._training.start(self._rays, pose, None)
+        self._training.start(0, self._rays, pose, None)
         self._training.wait()
         return list(self._trained)
 

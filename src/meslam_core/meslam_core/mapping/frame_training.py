@@ -23,9 +23,13 @@ from meslam_core.se3 import Pose
 # frames make up for the rest, so many steps each.
 FIRST_STEPS_SHARE = 0.4
 MADE_UP_A_FRAME = 40
+# `mapping.min_iterations` are of frames that follow each other within so long [s]; a frame that comes
+# later stands for those that were passed over, and what it shows anew takes their steps, too.
+FRAME_PERIOD_S = 1.0 / 15.0
 # A region that knows its box is trained beside another one at this share of the
 # learning rate, which evens out what the full rate leaves and forgets nothing for what lies ahead.
 SETTLED_RATE_FACTOR = 0.25
+NANOSECONDS = 1e-9
 
 
 class FrameTraining:
@@ -39,7 +43,7 @@ class FrameTraining:
         optimizer: trains them.
         scratch: where the keyframes' images lie.
         frames_wait: whether frames wait to be tracked. While they do, training gives way: it ends
-            after `mapping.min_iterations` steps.
+            after `mapping.min_iterations` steps, or more where frames were skipped.
 
     Attributes:
         latest: what the latest training did that was waited for.
@@ -60,6 +64,7 @@ class FrameTraining:
         self._worker = TrainingWorker()
         self._trained: list[Region] = []
         self._steps_owed = 0
+        self._trained_ns: int | None = None
         self._turn = 0
         self._registration = KeyframeRegistration(config, atlas, scratch, frames_wait)
 
@@ -79,20 +84,24 @@ class FrameTraining:
         self._steps_owed = self._optimizer.config.first_iterations
         self._worker.start(self._train_first)
 
-    def start(self, current: Rays, T_map_current: Pose, keyframe: NewKeyframe | None) -> None:
+    def start(
+        self, stamp_ns: int, current: Rays, T_map_current: Pose, keyframe: NewKeyframe | None
+    ) -> None:
         """Begin to train with a frame.
 
         Args:
+            stamp_ns: of its image [ns].
             current: rays of the frame, camera frame.
             T_map_current: (4, 4) its pose.
             keyframe: what it is as a keyframe, where it is one.
         """
         config = self._optimizer.config
         steps = config.iterations if keyframe is None else config.keyframe_iterations
+        least = min(steps, config.min_iterations * self._frames_since(stamp_ns))
         steps += min(self._steps_owed, MADE_UP_A_FRAME)
         self._trained = self._next_to_train()
         self._worker.start(
-            partial(self._train, self._trained, steps, current, T_map_current, keyframe)
+            partial(self._train, self._trained, least, steps, current, T_map_current, keyframe)
         )
 
     def wait(self) -> bool:
@@ -111,6 +120,13 @@ class FrameTraining:
         """Wait until the training that runs has ended, without taking up what it did."""
         self._worker.settle()
 
+    def _frames_since(self, stamp_ns: int) -> int:
+        """How many frames this one stands for."""
+        before, self._trained_ns = self._trained_ns, stamp_ns
+        if before is None:
+            return 1
+        return max(1, round((stamp_ns - before) * NANOSECONDS / FRAME_PERIOD_S))
+
     def _next_to_train(self) -> list[Region]:
         """The working region, and in turn one of the others that contain the camera.
 
@@ -124,12 +140,16 @@ class FrameTraining:
     def _train(
         self,
         regions: list[Region],
+        least: int,
         steps: int,
         current: Rays,
         pose: Pose,
         keyframe: NewKeyframe | None,
     ) -> Training:
-        """Train the working region, which comes first, and the other one half as long."""
+        """Train the working region, which comes first, and the other one half as long.
+
+        At least `least` steps are taken, and as many as `steps` where no frame waits.
+        """
         started = time.perf_counter()
         # While frames wait, either a view is marked or a registration made.
         registers = self._turn % 2
@@ -137,7 +157,6 @@ class FrameTraining:
         if keyframe is not None:
             self._registration.add(keyframe)
             pose = self._registration.proceed(registers) @ pose
-        least = self._optimizer.config.min_iterations
         losses = self._optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
         )

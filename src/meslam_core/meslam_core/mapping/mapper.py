@@ -192,7 +192,7 @@ class Mapper:
         keyframe = self._add_keyframe(sampled, T_map_camera, odometry) if is_keyframe else None
         current = sampled.rays(CURRENT_FRAME_RAYS)
         self.look()
-        self._training.start(current, T_map_camera, keyframe)
+        self._training.start(sampled.frame.stamp_ns, current, T_map_camera, keyframe)
         return is_keyframe
 
     def wait(self) -> Training:

@@ -73,7 +73,8 @@ def exit_after_run(outcome: RunOutcome, out: Path) -> None:
     if outcome.lost:
         complain(
             f"tracking was lost and never recovered; {tracked} of {frames} frames were tracked, "
-            f"their results are in {out}. Move the camera more slowly, over surfaces within range"
+            f"their results are in {out}. The last frame's reason: {outcome.lost}. If it was the "
+            "motion, move the camera more slowly, over surfaces within range"
         )
         status = TRACKING_LOST
     if outcome.broke_off:

@@ -104,14 +104,14 @@ class RunOutcome:
         report: the content of `report.json`.
         broke_off: why the recording ended early; empty when it did not.
         interrupted: whether the user ended the run.
-        lost: whether tracking was lost at the end, or never started.
+        lost: why tracking was lost at the end, or never started; empty where it was not.
         not_evaluated: why the given truth could not be compared with; empty when it was.
     """
 
     report: dict[str, Any]
     broke_off: str
     interrupted: bool
-    lost: bool
+    lost: str
     not_evaluated: str
 
 
@@ -170,7 +170,8 @@ def run(
         report.update(run_environment())
         results.write_report(report)
         results.publish()
-    lost = slam.state not in (TrackingState.OK, TrackingState.DEGRADED)
+    tracking = slam.state in (TrackingState.OK, TrackingState.DEGRADED)
+    lost = "" if tracking else loop.tally.reason or f"state {slam.state.name}"
     return RunOutcome(report, loop.broke_off, loop.interrupted, lost, not_evaluated)
 
 

@@ -27,10 +27,11 @@ LATE_MS = 100.0
 
 @dataclass
 class Tally:
-    """What accumulates over the frames of a run."""
+    """What accumulates over the frames of a run; `reason` is why the latest was not trusted."""
 
     frames: int = 0
     degraded: int = 0
+    reason: str = ""
     tracked_stamps_ns: list[int] = field(default_factory=list)
     tracked_covariances: list[NDArray[np.float64]] = field(default_factory=list)
     first_stamp_ns: int = 0
@@ -47,6 +48,7 @@ class Tally:
             self.first_stamp_ns = result.stamp_ns
         self.frames += 1
         self.last_stamp_ns = result.stamp_ns
+        self.reason = result.reason or self.reason
         self.degraded += result.state is TrackingState.DEGRADED
         if is_tracked(result):
             self.tracked_stamps_ns.append(result.stamp_ns)

@@ -23,6 +23,7 @@ from meslam_core.odometry import OdometryEstimate
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
+from meslam_core.tracking.depth_plausibility import is_stuck, unusable_depth, warn_of_depth
 from meslam_core.tracking.frame_history import KeyframePoses
 from meslam_core.tracking.frame_tracking import FrameTracking, TrackedPose
 from meslam_core.tracking.pixels import TrustedPixels, trusted_pixels
@@ -162,7 +163,8 @@ class Slam:
         started = time.perf_counter()
         pixels = TrustedPixels(trusted_pixels(frame.depth_m, self.config.sensor))
         sampled = SampledFrame(frame, pixels, self._generator)
-        enough = len(pixels) >= MIN_FRAME_PIXELS
+        enough = len(pixels) >= MIN_FRAME_PIXELS and not is_stuck(frame.depth_m)
+        doubt = "" if enough else unusable_depth(frame.depth_m, self.config.sensor)
         if self._view is not None:
             rays = sampled.rays(self.config.tracking.points) if enough else None
             witness = partial(self._recognised, frame, rays)
@@ -170,18 +172,18 @@ class Slam:
             if self.tracking.lost:
                 tracked = self._sought(frame, rays, odometry) or tracked
         elif enough:
+            warn_of_depth(frame.depth_m)
             tracked = self.tracking.start(self._T_map_first.copy())
         else:
-            reason = "too few pixels with depth"
             unknown = np.eye(6)
-            tracked = TrackedPose(self._T_map_first.copy(), unknown, False, reason, None)
+            tracked = TrackedPose(self._T_map_first.copy(), unknown, False, doubt, None)
         alignment = tracked.alignment
         result = FrameResult(
             stamp_ns=frame.stamp_ns,
             T_map_camera=tracked.T_map_camera,
             covariance=self._covariance(tracked),
             state=self.state,
-            reason=tracked.reason,
+            reason=doubt or tracked.reason,
             odometry=odometry,
             residual_m=alignment.residual_m if alignment else float("inf"),
             inlier_ratio=alignment.inlier_ratio if alignment else 0.0,

@@ -114,11 +114,20 @@ def call(client: MeslamClient, name: str, request: str, timeout_s: float) -> Any
         known = ", ".join(sorted(services(client))) or "none"
         raise CallError(f"there is no service {name}; there are: {known}")
     kind = interface(services(client)[name])
+    return client.call(kind, name, request_of(kind, request), timeout_s)
+
+
+def request_of(kind: Any, text: str) -> Any:
+    """The request to a service of a kind, its fields given in YAML.
+
+    Raises:
+        CallError: when the text is no YAML, or does not fit.
+    """
     try:
-        values = yaml.safe_load(request) or {}
+        values = yaml.safe_load(text) or {}
     except yaml.YAMLError as error:
         raise CallError(f"the request is no YAML: {error}") from error
-    return client.call(kind, name, fill(kind.Request(), values), timeout_s)
+    return fill(kind.Request(), values)
 
 
 def run(arguments: Sequence[str], show: Callable[[str], object] = print) -> int:

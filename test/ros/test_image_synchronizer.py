@@ -79,3 +79,12 @@ def test_recording_that_starts_again_is_paired_again() -> None:
     synchronizer = ImageSynchronizer(0.02)
     late = 10_000 * MS
     assert feed(synchronizer, "cdcd", late, late, 0, 0) == [late, 0]
+
+
+def test_images_with_wrong_stamps_do_not_fill_the_places_of_good_ones() -> None:
+    synchronizer = ImageSynchronizer(0.02)
+    wrong = [10**15 + number * PERIOD for number in range(2 * MAX_WAITING)]
+    assert feed(synchronizer, "d" * len(wrong), *wrong) == []
+    for number in range(3):
+        stamp = number * PERIOD
+        assert feed(synchronizer, "dc", stamp, stamp) == [stamp]

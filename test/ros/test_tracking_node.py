@@ -327,9 +327,29 @@ def test_recording_that_starts_again_begins_a_new_map(start_node, client) -> Non
     camera = Camera(client)
     camera.wait()
     first = camera.track(0, later_ns=100 * NANOSECONDS)
-    again = camera.track(0)
+    jumped = camera.track(0)
+    assert jumped.map_id == first.map_id
+    assert "stamp jumps by -100.000 s" in jumped.reason
+    again = camera.track(1)
     assert again.map_id != first.map_id
     assert again.state == TrackingStatus.OK
+
+
+@pytest.mark.parametrize("wrong_s", [-1.0, 1e9])
+def test_one_wrong_stamp_costs_one_frame_and_not_the_map(start_node, client, wrong_s) -> None:
+    """A driver that forgets a stamp, and one that takes it from another clock."""
+    start_node(TrackingNode, **FAST)
+    camera = Camera(client)
+    camera.wait()
+    later_ns = 100 * NANOSECONDS
+    before = [camera.track(number, later_ns) for number in range(2)][-1]
+    wrong = camera.track(2, round(wrong_s * NANOSECONDS))
+    assert "believed when the next" in wrong.reason
+    after = [camera.track(number, later_ns) for number in range(3, 5)]
+    assert all(status.state == TrackingStatus.OK for status in after)
+    assert after[-1].map_id == before.map_id
+    assert "stamps that jump: 1" in after[-1].drop_reasons
+    assert after[-1].frames_tracked == 4
 
 
 def wrong_encoding(messages: Messages) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import math
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,9 @@ from meslam_core.recordings.images import color_from_message, depth_from_message
 NANOSECONDS = 1_000_000_000
 MILLIMETRES = 1000.0
 MAX_DEPTH_MM = 65535
+# Farther away are neither robots nor their odometry's origins, not even in UTM coordinates.
+MAX_POSITION_M = 1e8
+MIN_NORM, MAX_NORM = 1e-3, 1e3
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -150,7 +154,7 @@ def from_pose(message: Pose) -> se3.Pose:
     """The (4, 4) pose [m] of a message; a quaternion of zeros, the default, is no rotation.
 
     Raises:
-        FrameError: when a number is not finite.
+        FrameError: when the numbers are no pose.
     """
     p, q = message.position, message.orientation
     return _checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
@@ -160,7 +164,7 @@ def from_transform(message: Transform) -> se3.Pose:
     """The (4, 4) pose [m] of a transform.
 
     Raises:
-        FrameError: when a number is not finite.
+        FrameError: when the numbers are no pose.
     """
     p, q = message.translation, message.rotation
     return _checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
@@ -181,10 +185,14 @@ def to_transform(T: se3.Pose, stamp: Time, parent: str, child: str) -> Transform
 
 
 def _checked_pose(position: tuple[float, ...], quaternion: tuple[float, ...]) -> se3.Pose:
-    if not np.isfinite([*position, *quaternion]).all():
-        raise FrameError(f"a pose has position {position} and quaternion {quaternion}")
     if not any(quaternion):
         quaternion = (0.0, 0.0, 0.0, 1.0)
+    # Comparisons with not-a-number are false.
+    near = all(abs(value) <= MAX_POSITION_M for value in position)
+    if not near or not MIN_NORM <= math.hypot(*quaternion) <= MAX_NORM:
+        raise FrameError(
+            f"position {position} m and quaternion {quaternion} are no pose; give finite numbers"
+        )
     return se3.from_quaternion(np.array(position), np.array(quaternion))
 
 

@@ -32,6 +32,15 @@ class ImagePair:
     arrival_s: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    """An image that has no partner yet; `arrival` counts them."""
+
+    stamp_ns: int
+    arrival: int
+    message: Image
+
+
 class ImageSynchronizer:
     """Collects images of two topics until each has its partner.
 
@@ -50,8 +59,9 @@ class ImageSynchronizer:
     def __init__(self, tolerance_s: float) -> None:
         self.dropped: Counter[str] = Counter()
         self.tolerance_s = tolerance_s
-        self._color: list[tuple[int, Image]] = []
-        self._depth: list[tuple[int, Image]] = []
+        self._color: list[_Waiting] = []
+        self._depth: list[_Waiting] = []
+        self._arrived = 0
         self._last_pair_ns: int | None = None
 
     @property
@@ -59,7 +69,8 @@ class ImageSynchronizer:
         """By how much the stamps of the newest images differ [s]; None without one of both."""
         if not self._color or not self._depth:
             return None
-        return abs(self._color[-1][0] - self._depth[-1][0]) / NANOSECONDS
+        newest = [max(w, key=lambda entry: entry.arrival) for w in (self._color, self._depth)]
+        return abs(newest[0].stamp_ns - newest[1].stamp_ns) / NANOSECONDS
 
     @property
     def _tolerance_ns(self) -> int:
@@ -74,16 +85,18 @@ class ImageSynchronizer:
         return self._add(self._depth, message, "depth image", self._tolerance_ns)
 
     def _add(
-        self, waiting: list[tuple[int, Image]], message: Image, name: str, lateness_ns: int
+        self, waiting: list[_Waiting], message: Image, name: str, lateness_ns: int
     ) -> Iterator[ImagePair]:
         stamp = stamp_ns(message.header.stamp)
         self._notice_restart(stamp)
         if self._last_pair_ns is not None and stamp <= self._last_pair_ns - lateness_ns:
             self.dropped[f"{name} came too late"] += 1
             return
-        insort(waiting, (stamp, message), key=lambda entry: entry[0])
+        self._arrived += 1
+        insort(waiting, _Waiting(stamp, self._arrived, message), key=lambda entry: entry.stamp_ns)
         if len(waiting) > MAX_WAITING:
-            waiting.pop(0)
+            # Not the one with the earliest stamp: others with wrong ones would stay for ever.
+            waiting.remove(min(waiting, key=lambda entry: entry.arrival))
             self.dropped[f"{name} without partner"] += 1
         while (pair := self._next_pair()) is not None:
             yield pair
@@ -97,17 +110,16 @@ class ImageSynchronizer:
 
     def _next_pair(self) -> ImagePair | None:
         """The earliest pair that no image still to come could improve."""
-        for place, (stamp, _) in enumerate(self._color):
-            nearest = min(
-                range(len(self._depth)),
-                key=lambda i: abs(self._depth[i][0] - stamp),
-                default=None,
-            )
-            if nearest is None:
-                return None
-            difference = abs(self._depth[nearest][0] - stamp)
+        depth_ns = [entry.stamp_ns for entry in self._depth]
+        if not depth_ns:
+            return None
+        for place, entry in enumerate(self._color):
+            stamp = entry.stamp_ns
+            differences = [abs(other - stamp) for other in depth_ns]
+            difference = min(differences)
+            nearest = differences.index(difference)
             # No camera is so fast that its next image would be nearer than a quarter.
-            certain = 4 * difference <= self._tolerance_ns or self._depth[-1][0] > stamp
+            certain = 4 * difference <= self._tolerance_ns or depth_ns[-1] > stamp
             if difference <= self._tolerance_ns and certain:
                 return self._take(place, nearest)
             if not certain:
@@ -118,8 +130,8 @@ class ImageSynchronizer:
         """Remove a pair, and what came before it without finding a partner."""
         self.dropped["colour image without partner"] += color_place
         self.dropped["depth image without partner"] += depth_place
-        stamp, color = self._color[color_place]
-        depth = self._depth[depth_place][1]
+        stamp, color = self._color[color_place].stamp_ns, self._color[color_place].message
+        depth = self._depth[depth_place].message
         del self._color[: color_place + 1]
         del self._depth[: depth_place + 1]
         self._last_pair_ns = stamp

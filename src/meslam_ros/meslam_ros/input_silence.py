@@ -93,6 +93,11 @@ class InputSilence:
         fresh = [s.topic for s in self._images if s.silence_s < self._settings.input_timeout_s]
         if len(fresh) == 1:
             return f"only {fresh[0]} still comes, the other stream has stopped"
+        if fresh:
+            return (
+                "images come, but their stamps do not grow or no longer make pairs; let the driver "
+                "stamp each image with the time it was taken at"
+            )
         return "the camera or player has paused"
 
     def _unpublished(self, missing: Sequence[MatchedSubscription]) -> str:

@@ -37,6 +37,9 @@ class MapKeeper:
         folder: for the maps.
         settings: how many, and how often.
         inform, warn: take messages for people.
+
+    Attributes:
+        failure: why the map could not be written the last time; empty when it could.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class MapKeeper:
         self._settings = settings
         self._inform = inform
         self._warn = warn
+        self.failure = ""
         self._kept: tuple[str, dict[RegionIndex, int]] = ("", {})
         self._store: MapStore | None = None
         self._pause_s = 0.0
@@ -100,9 +104,11 @@ class MapKeeper:
             try:
                 self._write(content)
             except (MeslamError, OSError) as error:
-                self._warn(f"the map is not kept below {self._folder}: {error}")
+                self.failure = f"the map is not kept below {self._folder}: {error}"
+                self._warn(self.failure)
                 self._pause_s = RETRY_S
                 return
+            self.failure = ""
             self._kept = versions
             self._pause_s = (time.monotonic() - started) / WRITE_SHARE
 

@@ -35,7 +35,6 @@ from meslam_ros.mesh_requests import MeshRequests
 from meslam_ros.node_settings import MapFrameSettings, MapServerSettings
 from meslam_ros.parameters import declare_config, declare_settings, read_config
 from meslam_ros.qos import MODELS_DEPTH, latched
-from meslam_ros.region_messages import model_name
 from meslam_ros.rgbd_input import STEADY
 from meslam_ros.served_map import ServedMap
 from meslam_ros.start_map import StartMap
@@ -44,6 +43,7 @@ from meslam_ros.tracking_client import TrackingClient
 from meslam_ros.transform_buffer import TransformBuffer
 
 EXECUTOR_THREADS = 8
+NAMED_REFUSED = 10
 
 
 class MapServerNode(ManagedNode):
@@ -136,8 +136,14 @@ class MapServerNode(ManagedNode):
         try:
             self._models.add(model)
         except MapError as error:
-            self._refused[model_name(model)] += 1
+            self._count_refused(model)
             self.get_logger().error(f"region model refused: {error}")
+
+    def _count_refused(self, model: RegionModel) -> None:
+        """By place; whoever sends any number of places is counted, and costs no memory."""
+        place = f"region {list(map(int, model.index))}"
+        known = place in self._refused or len(self._refused) < NAMED_REFUSED
+        self._refused[place if known else "other regions"] += 1
 
     def _lookup(self, frame: str, stamp_ns: int) -> Pose:
         """T_map_frame (4, 4) [m] at a time [ns]."""
@@ -148,6 +154,8 @@ class MapServerNode(ManagedNode):
         level, message = (OK, f"{len(entries)} regions") if entries else (STALE, "no region yet")
         if refused:
             level, message = WARN, f"region models refused: {refused}"
+        if self._keeper.failure:
+            level, message = WARN, self._keeper.failure
         self._diagnostics.report(
             level,
             message,
@@ -155,6 +163,7 @@ class MapServerNode(ManagedNode):
                 "regions": len(entries),
                 "map_bytes": sum(entry.size for entry in entries),
                 "refused": refused or "none",
+                "kept": self._keeper.failure or "yes",
             },
         )
 

@@ -57,6 +57,23 @@ class InputSettings:
         maximum=3600.0,
         live=True,
     )
+    overload_share: float = setting(
+        0.2,
+        "when this share of the image pairs of the last 5 s was skipped for lack of time, the "
+        "computer counts as overloaded: /meslam/status says DEGRADED, /diagnostics warns; 1 never",
+        minimum=0.01,
+        maximum=1.0,
+        live=True,
+    )
+    max_wait_s: float = setting(
+        1.0,
+        "while the computer is overloaded, an image pair that has waited longer is skipped for a "
+        "newer one, so that poses are not late besides",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+        live=True,
+    )
 
 
 @dataclass

@@ -183,13 +183,16 @@ def from_odometry(message: Odometry, mount: CameraMount) -> OdometryEstimate:
     """The camera's estimate from an odometry message of the base.
 
     Raises:
-        FrameError: when the pose is not finite.
+        FrameError: when its numbers are no pose.
     """
     T_base_camera = mount.T_base_optical
     covariance = np.array(message.twist.covariance).reshape(6, 6)
     reason = ""
     if message.child_frame_id.lstrip("/") != mount.base_frame:
         reason = f"the odometry is of {message.child_frame_id!r}, the base is {mount.base_frame!r}"
+    elif not np.isfinite(covariance).all():
+        covariance = np.eye(6) * UNKNOWN_VARIANCE
+        reason = "the odometry's covariance is not finite"
     elif covariance[0, 0] >= UNKNOWN_VARIANCE:
         reason = "the odometry says that it is not to be trusted"
     return OdometryEstimate(

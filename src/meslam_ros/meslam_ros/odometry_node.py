@@ -113,7 +113,7 @@ class OdometryNode(ManagedNode):
             level, message = (OK, "odometry valid") if latest.valid else (WARN, latest.reason)
         dropped = counts(worker.dropped)
         if dropped and level == OK:
-            level, message = WARN, f"images were lost: {dropped}"
+            level, message = WARN, worker.overload or f"images were lost: {dropped}"
         if latest is None and dropped:
             level, message = ERROR, f"no image could be used: {dropped}"
         self._diagnostics.report(

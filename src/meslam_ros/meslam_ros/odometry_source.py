@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 
 from meslam_core.config import OdometryConfig
+from meslam_core.errors import FrameError
 from meslam_core.frame import RgbdFrame
 from meslam_core.odometry import OdometryEstimate, given_noise
 from meslam_ros import topics
@@ -39,6 +40,7 @@ class OdometrySource:
 
     Attributes:
         odom_frame: that the latest odometry was given in.
+        refused: how many images had odometry whose numbers are no pose.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class OdometrySource:
         timeout_s: Callable[[], float],
     ) -> None:
         self.odom_frame = odom_frame
+        self.refused = 0
         self._node = node
         self._timeout_s = timeout_s
         self._noise = given_noise(config) if topic else None
@@ -78,7 +81,15 @@ class OdometrySource:
             mount: of the camera on the base.
             transforms: between the odometry's child frame and the camera.
         """
-        estimate = self._estimate(frame, mount, transforms)
+        try:
+            estimate = self._estimate(frame, mount, transforms)
+        except FrameError as error:
+            self.refused += 1
+            self._node.get_logger().error(
+                f"{self._subscription.topic_name}: {error}; tracked without odometry",
+                throttle_duration_sec=WARNING_PERIOD_S,
+            )
+            return None
         if estimate is None:
             return None
         last_ns, self._last_ns = self._last_ns, frame.stamp_ns

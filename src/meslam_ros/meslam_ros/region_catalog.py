@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from geometry_msgs.msg import Pose
 
+from meslam_core.errors import FrameError, MapError
 from meslam_core.regions.grid import RegionIndex
 from meslam_interfaces.msg import Region, RegionArray, RegionModel
-from meslam_ros.conversions import stamp_ns, to_stamp
+from meslam_ros.conversions import from_pose, stamp_ns, to_stamp
+
+MAX_SIDE_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,21 @@ class RegionEntry:
 
     @classmethod
     def of(cls, model: RegionModel) -> RegionEntry:
-        """The entry of a model."""
+        """The entry of a model.
+
+        Raises:
+            MapError: when its header cannot be that of a region.
+        """
+        sizes = model.size_m.x, model.observed_volume_m3
+        try:
+            from_pose(model.pose)
+        except FrameError as error:
+            raise MapError(f"region {region_index(model.index)}: {error}") from error
+        if not (0.0 < sizes[0] <= MAX_SIDE_M and 0.0 <= sizes[1] < math.inf):
+            raise MapError(
+                f"region {region_index(model.index)}: a box of {sizes[0]} m of which {sizes[1]} "
+                "m^3 were seen is none"
+            )
         return cls(
             index=region_index(model.index),
             version=model.version,

@@ -11,10 +11,11 @@ from rclpy.timer import Timer
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from meslam_core.errors import MapError
 from meslam_interfaces.msg import Region, RegionArray, RegionModel, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.conversions import to_stamp
-from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, Diagnostics
+from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, WARN, Diagnostics
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.markers import region_markers
 from meslam_ros.node_settings import MapFrameSettings, RegionManagerSettings
@@ -34,6 +35,7 @@ class RegionManagerNode(ManagedNode):
         self._config = declare_config(self, ("regions",))
         self._catalog = RegionCatalog()
         self._live_map_id = ""
+        self._refused = 0
         self._changed = False
         self._timer: Timer | None = None
         self.add_post_set_parameters_callback(self._retime)
@@ -81,10 +83,16 @@ class RegionManagerNode(ManagedNode):
     def _take_model(self, model: RegionModel) -> None:
         if self._live_map_id not in ("", model.map_id) or not self._catalog.is_news(model):
             return
+        try:
+            entry = RegionEntry.of(model)
+        except MapError as error:
+            self._refused += 1
+            self.get_logger().error(f"region model refused: {error}")
+            return
         if model.map_id != self._catalog.map_id:
             self._catalog.begin(model.map_id)
         is_new = region_index(model.index) not in self._catalog.entries
-        self._catalog.add(RegionEntry.of(model))
+        self._catalog.add(entry)
         self._changed = True
         if is_new:
             self._publish()
@@ -117,10 +125,14 @@ class RegionManagerNode(ManagedNode):
     def _diagnose(self) -> None:
         entries = self._catalog.entries.values()
         states = [entry.state for entry in entries]
+        level, message = (OK, f"{len(entries)} regions") if entries else (STALE, "no region yet")
+        if self._refused:
+            level, message = WARN, f"region models refused: {self._refused}"
         self._diagnostics.report(
-            OK if entries else STALE,
-            f"{len(entries)} regions" if entries else "no region yet",
+            level,
+            message,
             {
+                "refused": self._refused,
                 "regions": len(entries),
                 "training": states.count(Region.TRAINING),
                 "working": states.count(Region.WORKING),

@@ -7,13 +7,14 @@ import hashlib
 import numpy as np
 from geometry_msgs.msg import Vector3
 
-from meslam_core.errors import MapError
+from meslam_core.errors import FrameError, MapError
 from meslam_core.map.codec import FORMAT, decode, encode
 from meslam_core.map.stored_region import StoredRegion
 from meslam_interfaces.msg import RegionModel
-from meslam_ros.conversions import byte_array, stamp_ns, to_pose, to_stamp
+from meslam_ros.conversions import byte_array, from_pose, stamp_ns, to_pose, to_stamp
 
 MAX_MODEL_BYTES = 64 << 20
+SAME_POSE = 1e-6
 
 
 def region_model(region: StoredRegion, map_id: str, map_frame: str, precision: str) -> RegionModel:
@@ -44,6 +45,17 @@ def encoded_model(region: StoredRegion, data: bytes, map_id: str, map_frame: str
     return message
 
 
+def _same_box(message: RegionModel, region: StoredRegion) -> bool:
+    """Whether a message's header has the pose and size of the region that it holds."""
+    try:
+        T_map_region = from_pose(message.pose)
+    except FrameError:
+        return False
+    return message.size_m.x == region.side_m and np.allclose(
+        T_map_region, region.T_map_region, rtol=0.0, atol=SAME_POSE
+    )
+
+
 def model_name(message: RegionModel) -> str:
     """How a region model is called in messages to people."""
     return f"region {list(map(int, message.index))} version {message.version}"
@@ -71,4 +83,6 @@ def stored_region(message: RegionModel) -> StoredRegion:
         raise MapError(f"{name} holds {region.index} version {region.version} inside")
     if region.stamp_ns != stamp_ns(message.header.stamp):
         raise MapError(f"{name}: the stamps inside and outside differ")
+    if not _same_box(message, region):
+        raise MapError(f"{name}: the boxes inside and outside differ")
     return region

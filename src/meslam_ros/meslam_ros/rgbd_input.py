@@ -47,7 +47,10 @@ class _Calibration:
     @classmethod
     def of(cls, message: CameraInfo, topic: str) -> _Calibration:
         camera = camera_from_info(message, topic)
-        return cls(camera, Lens(camera, message.distortion_model, message.d))
+        try:
+            return cls(camera, Lens(camera, message.distortion_model, message.d))
+        except FrameError as error:
+            raise FrameError(f"{topic}: {error}") from error
 
 
 class RgbdInput:

@@ -63,16 +63,19 @@ def path_message(trajectory: Trajectory, T_camera_base: se3.Pose, frame_id: str)
     return path
 
 
-def health(result: FrameResult | None, dropped: str) -> tuple[bytes, str]:
+def health(result: FrameResult | None, dropped: str, overload: str = "") -> tuple[bytes, str]:
     """Level and sentence for /diagnostics.
 
     Args:
         result: of the latest frame; None before the first.
         dropped: images that were not used, with counts; empty when there were none.
+        overload: why the computer is too slow; empty when it is not.
     """
     if result is None:
         return (ERROR, f"images were not used: {dropped}") if dropped else (STALE, "no images yet")
     level = LEVELS.get(result.state, WARN)
+    if overload and level == OK:
+        return WARN, f"{overload} ({dropped})"
     if dropped and level == OK:
         return WARN, f"images were not used: {dropped}"
     return level, result.reason or result.state.name

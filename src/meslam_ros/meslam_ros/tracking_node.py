@@ -182,10 +182,13 @@ class TrackingNode(ManagedNode):
     def refuse(self, pair: ImagePair, reason: str) -> None:
         """Tell that a pair was not tracked, and why (`FrameConsumer`)."""
         result = self._session.result
+        state = result.state if result else TrackingState.INITIALISING
+        if state == TrackingState.OK and not self._paused:
+            state = TrackingState.DEGRADED
         self._publish_status(
             TrackingStatus(
                 header=header(pair.stamp_ns, self._frames.map_frame),
-                state=int(result.state if result else TrackingState.INITIALISING),
+                state=int(state),
                 reason=reason,
             ),
             time.monotonic() - pair.arrival_s,
@@ -240,6 +243,9 @@ class TrackingNode(ManagedNode):
         status.queue_length = self._worker.waiting
         status.paused = self._paused
         status.localising = session.localises
+        if status.state == TrackingStatus.OK and self._worker.overload:
+            # The pose is as good as ever, but there are not as many as the camera would give.
+            status.state, status.reason = TrackingStatus.DEGRADED, self._worker.overload
         self._latest_status = status
         self._status.publish(status)
 
@@ -281,12 +287,13 @@ class TrackingNode(ManagedNode):
         session, worker = self._session, self._worker
         result, dropped = session.result, counts(worker.dropped + session.discarded)
         self._diagnostics.report(
-            *health(result, dropped),
+            *health(result, dropped, worker.overload),
             {
                 "state": result.state.name if result else "INITIALISING",
                 "frames_tracked": session.tracked,
                 "dropped": dropped or "none",
                 "lost": counts(worker.input.lost) or "none",
+                "odometry_refused": self._odometry.refused,
                 "queue_length": worker.waiting,
                 "keyframes": session.keyframes,
                 "regions": len(session.regions),

@@ -60,6 +60,10 @@ def to_rgb(pixels: NDArray[np.uint8], encoding: str) -> NDArray[np.uint8]:
             f"colour image has the shape {pixels.shape}, expected {channels} bytes a pixel "
             f"for {encoding}"
         )
+    if channels == 2 and pixels.shape[1] % 2:
+        raise RecordingError(
+            f"{encoding} image is {pixels.shape[1]} pixels wide, but two of them share a colour"
+        )
     return pixels.copy() if conversion is None else _as_uint8(cv2.cvtColor(pixels, conversion))
 
 
@@ -95,13 +99,15 @@ def depth_from_message(message: Any) -> Pixels:
 
 def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> Pixels:
     """The rows of an Image, (height, width * channels), without their padding."""
+    if not message.width or not message.height:
+        raise RecordingError(f"{message.width}x{message.height} image has no pixels")
     used = message.width * channels * dtype.itemsize
     # Some drivers leave `step` at zero; then rows are contiguous.
     step = message.step or used
     if step < used or len(message.data) < step * (message.height - 1) + used:
         raise RecordingError(
             f"{message.width}x{message.height} {message.encoding} image has {len(message.data)} "
-            f"bytes in rows of {step}, expected rows of at least {used}; the recording is damaged"
+            f"bytes in rows of {step}, expected rows of at least {used}; the image is damaged"
         )
     data = np.frombuffer(message.data, np.uint8)[: step * message.height]
     if len(data) < step * message.height:

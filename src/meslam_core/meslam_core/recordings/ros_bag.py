@@ -273,12 +273,12 @@ class RosBagRecording:
             camera = PinholeCamera(
                 int(fields["width"]), int(fields["height"]), *map(float, (k[0], k[4], k[2], k[5]))
             )
+            return camera, Lens(camera, fields["distortion_model"], fields["d"])
         except FrameError as error:
             raise RecordingError(
                 f"{self.name}: the camera info on {info_topic} has no intrinsics ({error}); "
                 "give them with --camera camera.json"
             ) from error
-        return camera, Lens(camera, fields["distortion_model"], fields["d"])
 
     def _depth_registration(self, chosen: ChosenTopics) -> _Registration | None:
         """How depth gets into the colour camera, or None where it is there already."""

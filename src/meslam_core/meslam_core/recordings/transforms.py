@@ -75,11 +75,11 @@ class FrameTree:
             child = transform.child_frame_id.lstrip("/")
             position, rotation = transform.transform.translation, transform.transform.rotation
             quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-            if not np.linalg.norm(quaternion) > 0:
+            translation = np.array([position.x, position.y, position.z])
+            usable = np.isfinite(translation).all() and 0 < np.linalg.norm(quaternion) < np.inf
+            if not usable:
                 continue
-            T_parent_child = se3.from_quaternion(
-                np.array([position.x, position.y, position.z]), quaternion
-            )
+            T_parent_child = se3.from_quaternion(translation, quaternion)
             self._neighbours.setdefault(parent, {})[child] = T_parent_child
             self._neighbours.setdefault(child, {})[parent] = se3.inverse(T_parent_child)
 

@@ -1,0 +1,196 @@
+"""All nodes as processes of their own, a camera, and what may be asked of them after a fault."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from data.ros_camera import CameraDriver, Messages
+from data.textured_room import PERIOD_NS, frame_at, path
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+from meslam_core.frame import RgbdFrame
+from meslam_interfaces.msg import RegionModel, TrackingStatus
+from meslam_interfaces.srv import ListRegions
+from meslam_ros import topics
+from meslam_ros.client import MeslamClient
+from meslam_ros.conversions import NANOSECONDS
+from meslam_ros.processes import NodeProcess, ros_arguments
+from meslam_ros.qos import STREAM, latched
+
+NODES = ("map_server_node", "region_manager_node", "odometry_node", "tracking_node")
+STARTING_S = 120.0
+ANSWER_S = 90.0
+RESEND_S = 5.0
+THERE = path(8, step_m=0.008, step_deg=0.4)
+POSES = [*THERE, *THERE[-2:0:-1]]
+QUICK: dict[str, Any] = {
+    "mapping.first_iterations": 150,
+    "mapping.iterations": 8,
+    "mapping.keyframe_iterations": 10,
+    "mapping.final_iterations": 20,
+    "keyframes.rays": 2048,
+    "model_period_s": 0.1,
+    "idle_s": 0.3,
+    "keep_period_s": 0.1,
+    "transform_timeout_s": 1.0,
+}
+
+Change = Callable[[Messages], None]
+
+
+class LiveGraph:
+    """Running nodes and a camera that looks about a room, one image pair after the other.
+
+    Args:
+        client: somebody who uses the system.
+        folder: for maps, exports and logs.
+        nodes: to start.
+        mounted: whether /tf_static connects the camera to its base.
+        parameters: of all nodes.
+    """
+
+    def __init__(
+        self,
+        client: MeslamClient,
+        folder: Path,
+        nodes: tuple[str, ...] = NODES,
+        mounted: bool = True,
+        **parameters: Any,
+    ) -> None:
+        self.client = client
+        self.folder = folder
+        self.camera = CameraDriver(client.node, mounted=mounted)
+        self.models: dict[tuple[str, tuple[int, ...]], RegionModel] = {}
+        self.processes: dict[str, NodeProcess] = {}
+        self.reports: dict[str, DiagnosticStatus] = {}
+        self.stamp_ns = NANOSECONDS
+        self._views = [frame_at(pose) for pose in POSES]
+        self._place = 0
+        self._parameters = {
+            **QUICK,
+            "map_folder": folder / "maps",
+            "export_folder": folder / "exports",
+            **{name.replace("__", "."): value for name, value in parameters.items()},
+        }
+        subscribe = client.node.create_subscription
+        subscribe(RegionModel, topics.REGION_MODELS, self._take_model, latched(100))
+        subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._take_reports, STREAM)
+        for node in nodes:
+            self.start(node)
+
+    def start(self, node: str, name: str = "", **parameters: Any) -> NodeProcess:
+        """Start a node, with parameters of its own besides those of all."""
+        name = name or node
+        extra = ["-r", f"__node:={name}"] if name != node else []
+        arguments = ros_arguments({**self._parameters, **parameters}, extra)
+        process = NodeProcess(node, arguments, log=self.folder / f"{name}.log")
+        self.processes[name] = process
+        return process
+
+    def stop(self) -> list[int]:
+        """End all nodes; their exit statuses."""
+        return [process.stop() for process in self.processes.values()]
+
+    def until(self, condition: Callable[[], bool], what: str, timeout_s: float = ANSWER_S) -> None:
+        """Wait for something, or fail with the nodes' logs."""
+        assert self.client.spin_until(condition, timeout_s), f"never {what}\n{self.logs()}"
+
+    def view(self) -> RgbdFrame:
+        """The next view of the room, a frame's time later."""
+        self._place = (self._place + 1) % len(POSES)
+        self.stamp_ns += PERIOD_NS
+        return replace(self._views[self._place], stamp_ns=self.stamp_ns)
+
+    def send(self, change: Change = lambda messages: None) -> int:
+        """Send the next view, changed as a fault wants it; its stamp [ns]."""
+        return self.camera.send(self.view(), change)
+
+    def track(self, change: Change = lambda messages: None) -> TrackingStatus:
+        """Send the next view, again while nobody listens; tracking's answer."""
+        before = len(self.client.statuses)
+        deadline = time.monotonic() + STARTING_S
+        while time.monotonic() < deadline and self.processes["tracking_node"].status is None:
+            self.send(change)
+            if self.client.spin_until(lambda: len(self.client.statuses) > before, RESEND_S):
+                return self.client.statuses[-1]
+        raise AssertionError(f"tracking does not answer\n{self.logs()}")
+
+    def track_well(self, count: int = 2, tries: int = 15) -> TrackingStatus:
+        """Send good views until so many in a row are tracked well; the last answer."""
+        row, answers = 0, []
+        for _ in range(tries):
+            status = self.track()
+            answers.append((status.state, status.reason))
+            row = row + 1 if status.state == TrackingStatus.OK else 0
+            if row == count:
+                return status
+        raise AssertionError(f"not tracked well again: {answers}\n{self.logs()}")
+
+    def served(self) -> dict[tuple[int, ...], int]:
+        """The map server's regions and their versions."""
+        regions = self.client.call(ListRegions, topics.LIST_REGIONS).regions
+        self.map_id = regions.map_id
+        return {tuple(region.index): region.version for region in regions.regions}
+
+    def settle(self) -> str:
+        """Wait until the map is refined, published and served; its identity."""
+        self.until(lambda: self.client.settled, "settled")
+        map_id = self.client.statuses[-1].map_id
+        expected = {
+            index: model.version for (id_, index), model in self.models.items() if id_ == map_id
+        }
+        self.until(lambda: self.served() == expected and self.map_id == map_id, "served")
+        return map_id
+
+    def reported(self, node: str, *words: str) -> str:
+        """Wait until a node's diagnosis has all these words; the diagnosis."""
+
+        def text() -> str:
+            status = self.reports.get(node)
+            if status is None:
+                return ""
+            return " ".join([status.message, *(f"{v.key}={v.value}" for v in status.values)])
+
+        self.until(lambda: all(word in text() for word in words), f"diagnosed {words} at {node}")
+        return self.reports[node].message
+
+    def logged(self, node: str, *words: str) -> None:
+        """Wait until a node has logged all these words."""
+        self.until(
+            lambda: all(word in self.processes[node].output() for word in words),
+            f"logged {words} by {node}",
+        )
+
+    def assert_alive(self) -> None:
+        """No node has ended, and none has met an exception that it did not expect."""
+        dead = {name: p.status for name, p in self.processes.items() if p.status is not None}
+        assert not dead, f"ended: {dead}\n{self.logs()}"
+        assert "Traceback" not in self.logs(), self.logs()
+
+    def logs(self) -> str:
+        """What all nodes have logged."""
+        return "\n".join(f"--- {name}\n{p.output()}" for name, p in self.processes.items())
+
+    def _take_model(self, model: RegionModel) -> None:
+        self.models[model.map_id, tuple(map(int, model.index))] = model
+
+    def _take_reports(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.reports[status.name.split(":")[-1].strip()] = status
+
+
+@contextmanager
+def live_graph(folder: Path, **options: Any) -> Iterator[LiveGraph]:
+    """A running graph that is tracked well; its nodes end with the context."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with MeslamClient("faults") as client:
+        graph = LiveGraph(client, folder, **options)
+        try:
+            yield graph
+        finally:
+            graph.stop()

@@ -44,7 +44,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "report/templates/*"]},
     ext_modules=kernel_extensions(),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from meslam_core import __version__, cli_doctor, cli_map
+from meslam_core import __version__, cli_doctor, cli_map, cli_report
 from meslam_core.command_output import (
     BAD_INPUT,
     complain,
@@ -213,6 +213,7 @@ def evaluate(
 
 
 app.add_typer(cli_map.app)
+app.add_typer(cli_report.app)
 app.add_typer(cli_doctor.app)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,7 +57,7 @@ def run_summary(report: Mapping[str, Any], out: Path) -> str:
             f"ATE {report['ate_rmse_m'] * 100:.2f} cm, online "
             f"{report['ate_online_rmse_m'] * 100:.2f} cm over {report['poses_compared']} poses"
         )
-    lines.append(f"results in {out}")
+    lines.append(f"results in {out}; look at them with: meslam report {shlex.quote(str(out))}")
     return "\n".join(lines)
 
 

@@ -49,7 +49,7 @@ def plot_path(path: Path, error: AbsoluteError, title: str) -> None:
         OutputError: when the picture cannot be written.
     """
     figure, axes = _figure(7.5, 6.0)
-    across, up = _ground_axes(error.truth)
+    across, up = ground_axes(error.truth)
     truth, estimate = error.truth.positions, error.estimate.positions
     axes.plot(truth[:, across], truth[:, up], color=TRUTH_COLOR, linewidth=3.5, label="truth")
     corners = estimate[:, [across, up]]
@@ -78,7 +78,7 @@ def plot_path_alone(path: Path, estimate: Trajectory, title: str) -> None:
         OutputError: when the picture cannot be written.
     """
     figure, axes = _figure(7.0, 6.0)
-    across, up = _ground_axes(estimate)
+    across, up = ground_axes(estimate)
     positions = estimate.positions
     axes.plot(positions[:, across], positions[:, up], label="estimate")
     axes.plot(*positions[0, [across, up]], "o", color="black", markersize=6, label="start")
@@ -144,7 +144,7 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, figure.subplots()
 
 
-def _ground_axes(trajectory: Trajectory) -> tuple[int, int]:
+def ground_axes(trajectory: Trajectory) -> tuple[int, int]:
     """The two axes across the mean direction in which the camera's image points down."""
     down = np.abs(trajectory.rotations[:, :, 1].mean(axis=0))
     across, up = (axis for axis in range(3) if axis != int(np.argmax(down)))

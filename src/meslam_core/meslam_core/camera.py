@@ -5,12 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from meslam_core.errors import FrameError
+from meslam_core.input_file import read_file
 from meslam_core.se3 import Pose
+
+MAX_PIXELS = 1 << 26
+"""Images larger than this are refused before memory is taken for them."""
+MAX_SIDE_PX = 1 << 15
+LEAST_FOCAL_PX, MOST_FOCAL_PX = 1e-2, 1e6
+MAX_DESCRIPTION_BYTES = 1 << 20
+MAX_COARSENESS = 64
+"""Pixels of a colour image along a side that one pixel of its depth image may cover."""
 
 # A camera that looks along its body's x axis, z up (REP-103); so looks the first one of a map.
 T_BODY_OPTICAL: Pose = np.array(
@@ -30,7 +40,7 @@ class PinholeCamera:
         cx, cy: principal point [px].
 
     Raises:
-        FrameError: when a size or a focal length is not positive and finite.
+        FrameError: when a size, a focal length or the principal point is none of a camera.
     """
 
     width: int
@@ -42,8 +52,10 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        usable = all(np.isfinite(values)) and self.fx > 0 and self.fy > 0
-        if not usable or self.width <= 0 or self.height <= 0:
+        focal = all(LEAST_FOCAL_PX <= f <= MOST_FOCAL_PX for f in values[:2])
+        usable = focal and all(abs(c) <= MOST_FOCAL_PX for c in values[2:])
+        sides = all(0 < side <= MAX_SIDE_PX for side in (self.width, self.height))
+        if not usable or not sides or self.width * self.height > MAX_PIXELS:
             raise FrameError(
                 f"camera intrinsics are unusable: {self.width}x{self.height} fx={self.fx} "
                 f"fy={self.fy} cx={self.cx} cy={self.cy}; is the camera calibrated and does its "
@@ -110,20 +122,26 @@ class PinholeCamera:
         Raises:
             FrameError: when the file is unreadable, a key is missing or a value is unusable.
         """
+        return cls.described(path)[0]
+
+    @classmethod
+    def described(cls, path: Path) -> tuple[PinholeCamera, dict[str, Any]]:
+        """The camera of a `camera.json`, and everything the file says; raises as `from_json`."""
         try:
-            values = json.loads(Path(path).read_text())
-            return cls(
+            values = json.loads(read_file(path, MAX_DESCRIPTION_BYTES))
+            camera = cls(
                 width=int(values["width"]),
                 height=int(values["height"]),
                 **{key: float(values[key]) for key in ("fx", "fy", "cx", "cy")},
             )
         except FrameError as error:
             raise FrameError(f"{path}: {error}") from error
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             raise FrameError(
                 f"{path} is not a camera description ({error!r}); "
                 "expected JSON with width, height, fx, fy, cx, cy"
             ) from error
+        return camera, values
 
 
 def register_depth_to_color(
@@ -141,7 +159,19 @@ def register_depth_to_color(
 
     Returns:
         (H, W) float32 depth in the colour camera [m], 0 where nothing projects.
+
+    Raises:
+        FrameError: when the focal lengths are of cameras that cannot belong together.
     """
+    # A pixel of a coarser depth image covers several of a finer colour image.
+    half_u = 0.5 * color_camera.fx / depth_camera.fx
+    half_v = 0.5 * color_camera.fy / depth_camera.fy
+    if max(half_u, half_v) > 0.5 * MAX_COARSENESS:
+        raise FrameError(
+            f"focal lengths of {color_camera.fx:g} x {color_camera.fy:g} px for colour and "
+            f"{depth_camera.fx:g} x {depth_camera.fy:g} px for depth do not belong together; "
+            "check both camera_info"
+        )
     rotation = np.asarray(T_color_depth, np.float32)[:3, :3]
     translation = np.asarray(T_color_depth, np.float32)[:3, 3]
     # Rays are a sum of a row's and a column's part: no (h, w, 3) array is needed.
@@ -156,9 +186,6 @@ def register_depth_to_color(
     z = z[seen]
     u = x[seen] / z * np.float32(color_camera.fx) + np.float32(color_camera.cx)
     v = y[seen] / z * np.float32(color_camera.fy) + np.float32(color_camera.cy)
-    # A pixel of a coarser depth image covers several of a finer colour image.
-    half_u = 0.5 * color_camera.fx / depth_camera.fx
-    half_v = 0.5 * color_camera.fy / depth_camera.fy
     u_first = np.floor(u - np.float32(half_u - 1)).astype(np.int32)
     v_first = np.floor(v - np.float32(half_v - 1)).astype(np.int32)
     registered = np.full(color_camera.width * color_camera.height, np.inf, np.float32)

@@ -48,6 +48,10 @@ __all__ = [
 ]
 
 
+MAX_OVERRIDE = 3000
+"""Characters of a setting's text; numbers of more digits cannot be printed."""
+
+
 @dataclass(frozen=True)
 class MeslamConfig:
     """The whole configuration, one section a part of the system."""
@@ -100,11 +104,11 @@ class MeslamConfig:
         for text in overrides:
             path, equals, value = text.partition("=")
             section, dot, name = path.strip().partition(".")
-            if not equals or not dot:
-                raise ConfigError(f"{text!r} is not of the form section.name=value")
+            if not equals or not dot or len(text) > MAX_OVERRIDE:
+                raise ConfigError(f"{text[:100]!r} is not of the form section.name=value")
             try:
                 values.setdefault(section, {})[name] = _parsed(value)
-            except yaml.YAMLError as error:
+            except (yaml.YAMLError, ValueError, RecursionError) as error:
                 raise ConfigError(f"the value of {text!r} is neither number nor text") from error
         return cls.from_mapping(values)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -63,7 +64,7 @@ class Continuation:
             raise MapError(f"{path} holds no region to continue")
         regions = []
         for entry in store.manifest().regions:
-            data = (path / entry.file).read_bytes()
+            data = loaded.encoded[entry.index]
             regions.append((codec.decode(data, entry.file), data))
         return cls(loaded.map_id, loaded.grid, regions, T_map_camera)
 
@@ -152,9 +153,10 @@ def read_start_pose(text: str) -> Pose:
     """
     values = text.replace(",", " ").split()
     if len(values) != POSE_VALUES:
-        path = Path(text)
-        if path.is_file():
-            return np.asarray(read_tum(path).poses[0], np.float64)
+        # A text that is too long for a path, or holds what no path may, is an error to the system.
+        with suppress(OSError, ValueError):
+            if Path(text).is_file():
+                return np.asarray(read_tum(Path(text)).poses[0], np.float64)
         raise ConfigError(
             f"--start-pose {text!r} is neither 'x y z qx qy qz qw' nor a file with poses"
         )

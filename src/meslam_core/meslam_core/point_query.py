@@ -37,8 +37,10 @@ def read_points(path: Path) -> NDArray[np.float64]:
     """
     expected = "expected a .npy file of an (N, 3) array of numbers: x, y, z in the map frame [m]"
     try:
-        points = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        # Mapped, an array cannot be larger than its file, whatever the header says.
+        points = np.load(path, mmap_mode="r", allow_pickle=False)
+    # numpy lets the errors of the header's parser through.
+    except Exception as error:
         raise MapError(f"{path} cannot be read as points ({error}); {expected}") from error
     if not isinstance(points, np.ndarray):
         raise MapError(f"{path} holds several arrays; {expected}")

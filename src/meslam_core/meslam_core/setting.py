@@ -8,6 +8,9 @@ from typing import Any, TypeVar, cast
 
 from meslam_core.errors import ConfigError
 
+# Larger whole numbers may be more than a float holds.
+LARGEST_WHOLE = 10**300
+
 T = TypeVar("T", int, float, bool, str)
 
 
@@ -66,7 +69,7 @@ class Setting:
             ConfigError: when the type is wrong or the value out of range.
         """
         kind: Any = type(self.default)
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        if kind is float and type(value) is int and abs(value) < LARGEST_WHOLE:
             value = float(value)
         if kind is str and type(value) is int:
             # ROS and YAML read a serial number or a folder named 2024 as a number.

@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from meslam_core.errors import EvaluationError, OutputError
 
 NANOSECONDS = 1_000_000_000
+MAX_STAMP_NS = 2**63 - 1
+MAX_METERS = 1e9
 TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
@@ -167,9 +169,16 @@ def parsed_stamp(text: str) -> int:
     """The stamp [ns] of decimal seconds, every digit of them.
 
     Raises:
-        ValueError, OverflowError, decimal.InvalidOperation: when it is no finite number.
+        ValueError: when it is no finite number, or more than 64 bits hold.
     """
-    return int((Decimal(text) * NANOSECONDS).to_integral_value())
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation as error:
+        raise ValueError(f"{text!r} is not a number of seconds") from error
+    # Compared before it is multiplied: a large exponent would make millions of digits.
+    if not seconds.is_finite() or abs(seconds) > MAX_STAMP_NS // NANOSECONDS:
+        raise ValueError(f"{text!r} seconds are out of range")
+    return int((seconds * NANOSECONDS).to_integral_value())
 
 
 def _parse(path: Path, number: int, content: list[str]) -> tuple[int, list[float]]:
@@ -180,10 +189,10 @@ def _parse(path: Path, number: int, content: list[str]) -> tuple[int, list[float
     try:
         stamp = parsed_stamp(content[0])
         row = [float(value) for value in content[1:]]
-    except (InvalidOperation, ValueError, OverflowError) as error:
+    except ValueError as error:
         raise EvaluationError(f"{where}: not a number; expected `{TUM_COLUMNS}`") from error
-    if not np.isfinite(row).all() or abs(stamp) > np.iinfo(np.int64).max:
-        raise EvaluationError(f"{where}: a value is not finite")
+    if not np.isfinite(row).all() or np.abs(row[:3]).max() > MAX_METERS:
+        raise EvaluationError(f"{where}: a value is not finite, or a position beyond all places")
     norm = float(np.linalg.norm(row[3:]))
     if not 0.9 < norm < 1.1:
         raise EvaluationError(

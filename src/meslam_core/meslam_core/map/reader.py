@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from meslam_core.errors import MapError
+from meslam_core.input_file import read_file
 from meslam_core.map import codec
 from meslam_core.map.manifest import (
     MANIFEST,
@@ -67,8 +68,7 @@ def read_manifest(path: Path) -> bytes:
         MapError: when it is not there or cannot be read.
     """
     try:
-        with open(path / MANIFEST, "rb") as file:
-            return file.read(MAX_MANIFEST_BYTES + 1)
+        return read_file(path / MANIFEST, MAX_MANIFEST_BYTES)
     except (FileNotFoundError, NotADirectoryError):
         if not path.is_dir():
             raise MapError(f"{path} does not exist or is no folder of a map") from None
@@ -143,6 +143,5 @@ def _rebuilt(path: Path, reason: str) -> LoadedMap:
 
 
 def _read_limited(path: Path) -> bytes:
-    """A region file's bytes, one more than the maximum at most."""
-    with open(path, "rb") as file:
-        return file.read(codec.MAX_FILE_BYTES + 1)
+    """A region file's bytes; OSError when they are more than a region may have."""
+    return read_file(path, codec.MAX_FILE_BYTES)

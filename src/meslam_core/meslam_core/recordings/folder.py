@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.errors import RecordingError
+from meslam_core.input_file import read_file
 from meslam_core.recordings.image_files import (
+    MAX_LIST_BYTES,
     CameraFile,
     ImageFileRecording,
     ImagePair,
-    parse_stamp_ns,
 )
 from meslam_core.recordings.pairing import ordered_pairs
+from meslam_core.trajectory import parsed_stamp
 
 MILLIMETRE_M = 0.001
 _IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff"})
@@ -83,10 +85,8 @@ def _stamps(path: Path, count: int, fps: float | None) -> NDArray[np.int64]:
             )
         return np.array([round(number * 1e9 / fps) for number in range(count)], np.int64)
     try:
-        lines = file.read_text().splitlines()
-        stamps = [
-            parse_stamp_ns(line) for line in lines if line.strip() and not line.startswith("#")
-        ]
+        lines = read_file(file, MAX_LIST_BYTES).decode().splitlines()
+        stamps = [parsed_stamp(line) for line in lines if line.strip() and not line.startswith("#")]
     except (OSError, ValueError) as error:
         raise RecordingError(f"{file} is not one number of seconds a line: {error}") from error
     if len(stamps) != count:

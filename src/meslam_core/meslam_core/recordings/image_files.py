@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,9 +13,15 @@ from numpy.typing import NDArray
 from meslam_core.camera import PinholeCamera
 from meslam_core.errors import FrameError, RecordingError
 from meslam_core.frame import RgbdFrame, depth_to_metres
+from meslam_core.input_file import read_file
 from meslam_core.recordings.images import decode_color, decode_depth
 
 T = TypeVar("T")
+
+MAX_IMAGE_BYTES = 1 << 28
+MAX_LIST_BYTES = 1 << 26
+# Of the numbers in a camera.json: whatever is beyond is a mistake.
+LEAST, MOST = 1e-9, 1e9
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class ImageFileRecording:
 
 def _decoded(path: Path, decode: Callable[[bytes], T]) -> T:
     try:
-        return decode(path.read_bytes())
+        return decode(read_file(path, MAX_IMAGE_BYTES))
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
     except RecordingError as error:
@@ -112,10 +115,9 @@ class CameraFile:
             RecordingError: when it is unreadable, or depth is not registered to colour.
         """
         try:
-            camera = PinholeCamera.from_json(path)
+            camera, values = PinholeCamera.described(path)
         except FrameError as error:
             raise RecordingError(str(error)) from error
-        values: dict[str, Any] = json.loads(path.read_text())
         if not values.get("depth_aligned_to_color", True):
             raise RecordingError(
                 f"{path} says that depth is not aligned to colour; register the depth images first"
@@ -127,25 +129,21 @@ class CameraFile:
         )
 
 
+def listed_file(folder: Path, name: str) -> Path:
+    """A file that a list in a folder names.
+
+    Raises:
+        ValueError: when the name leads out of the folder.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+        raise ValueError(f"{name!r} leads out of the folder")
+    return folder / name
+
+
 def _positive(path: Path, values: dict[str, Any], key: str) -> float | None:
     value = values.get(key)
     if value is None:
         return None
-    if isinstance(value, int | float) and math.isfinite(value) and value > 0:
+    if isinstance(value, int | float) and LEAST <= value <= MOST:
         return float(value)
     raise RecordingError(f"{path}: {key} is {value!r}, expected a positive number")
-
-
-def parse_stamp_ns(text: str) -> int:
-    """A decimal number of seconds as nanoseconds, without the rounding of a float.
-
-    Raises:
-        ValueError: when the text is not a finite number.
-    """
-    try:
-        stamp_ns = int((Decimal(text) * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError) as error:
-        raise ValueError(f"{text!r} is not a number of seconds") from error
-    if abs(stamp_ns) >= 2**63:
-        raise ValueError(f"{text!r} seconds are out of range")
-    return stamp_ns

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
+from meslam_core.camera import MAX_PIXELS
 from meslam_core.errors import RecordingError
 
 Pixels = NDArray[Any]
+
+IMAGE_FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
 
 _PNG_SIGNATURE = b"\x89PNG"
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
@@ -160,9 +165,21 @@ def decode_depth(data: bytes) -> Pixels:
 
 
 def _decode(data: bytes, flags: int) -> Pixels:
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    damaged = f"image data ({len(data)} bytes) is damaged or of an unknown format"
+    try:
+        with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as header:
+            width, height = header.size
+    # Only the header is read, but its parsers let all kinds of errors through.
+    except Exception as error:
+        raise RecordingError(damaged) from error
+    if width * height > MAX_PIXELS:
+        raise RecordingError(f"a {width}x{height} image is larger than any camera's")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise RecordingError(damaged) from error
     if pixels is None:
-        raise RecordingError(f"image data ({len(data)} bytes) is damaged or of an unknown format")
+        raise RecordingError(damaged)
     return pixels
 
 

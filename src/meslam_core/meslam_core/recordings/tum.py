@@ -10,13 +10,16 @@ import numpy as np
 
 from meslam_core.camera import PinholeCamera
 from meslam_core.errors import RecordingError
+from meslam_core.input_file import read_file
 from meslam_core.recordings.image_files import (
+    MAX_LIST_BYTES,
     CameraFile,
     ImageFileRecording,
     ImagePair,
-    parse_stamp_ns,
+    listed_file,
 )
 from meslam_core.recordings.pairing import ordered_pairs
+from meslam_core.trajectory import parsed_stamp
 
 DEPTH_SCALE_M = 1.0 / 5000.0
 """Length of one unit of the benchmark's depth images [m]."""
@@ -67,7 +70,7 @@ def open_tum(path: Path, camera: PinholeCamera | None = None) -> ImageFileRecord
 def _read_list(path: Path) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], list[Path]]:
     stamps, files = [], []
     try:
-        lines = path.read_text().splitlines()
+        lines = read_file(path, MAX_LIST_BYTES).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error
     for number, line in enumerate(lines, start=1):
@@ -76,12 +79,12 @@ def _read_list(path: Path) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], 
             continue
         try:
             stamp, name = fields
-            stamps.append(parse_stamp_ns(stamp))
+            stamps.append(parsed_stamp(stamp))
+            files.append(listed_file(path.parent, name))
         except ValueError as error:
             raise RecordingError(
-                f"{path}, line {number}: expected `seconds file`, found {line!r}"
+                f"{path}, line {number}: expected `seconds file`, found {line!r} ({error})"
             ) from error
-        files.append(path.parent / name)
     return np.array(stamps, np.int64), files
 
 

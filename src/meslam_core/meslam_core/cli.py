@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from meslam_core import __version__, cli_doctor, cli_map, cli_report
+from meslam_core import __version__, cli_doctor, cli_map, cli_report, cli_view
 from meslam_core.command_output import (
     BAD_INPUT,
     complain,
@@ -214,6 +214,7 @@ def evaluate(
 
 app.add_typer(cli_map.app)
 app.add_typer(cli_report.app)
+app.add_typer(cli_view.app)
 app.add_typer(cli_doctor.app)
 
 
@@ -286,7 +287,8 @@ def simulate(
 
 
 def _frame_range(text: str) -> slice:
-    match = re.fullmatch(r"(\d*):(\d*)(?::(\d+))?", text.strip())
+    number = r"\d{0,18}"
+    match = re.fullmatch(rf"({number}):({number})(?::(\d{number}))?", text.strip())
     if match is None:
         raise ConfigError(f"--frames {text!r} is not of the form A:B or A:B:STEP, as in 0:100:2")
     start, stop, step = (int(part) if part else None for part in match.groups())

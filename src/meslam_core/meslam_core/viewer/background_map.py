@@ -53,7 +53,8 @@ class BackgroundMap:
         self._lock = threading.Lock()
         self._models: dict[RegionIndex, _Model] = {}
         self._map_number = 0
-        self._exports: list[tuple[float, str, Future[bytes]]] = []
+        self._exporting = threading.Lock()
+        self._wanted: tuple[float, str, Future[bytes]] | None = None
         self._known: dict[RegionIndex, int] = {}
         self._known_map = 0
         self._sliced: tuple[object, ...] = ()
@@ -82,21 +83,26 @@ class BackgroundMap:
             suffix: of the file's name, one of `map.mesh_file.FORMATS`.
 
         Raises:
-            MapError: when there is no map, or it would be too large.
+            MapError: when there is no map, it would be too large, or another one is being made.
         """
-        future: Future[bytes] = Future()
-        with self._lock:
-            if self._stopping.is_set():
-                raise MapError("the viewer is being closed")
-            self._exports.append((resolution_m, suffix, future))
-        return future.result()
+        if not self._exporting.acquire(blocking=False):
+            raise MapError("another mesh is being made; try again in a moment")
+        try:
+            future: Future[bytes] = Future()
+            with self._lock:
+                if self._stopping.is_set():
+                    raise MapError("the viewer is being closed")
+                self._wanted = resolution_m, suffix, future
+            return future.result()
+        finally:
+            self._exporting.release()
 
     def close(self) -> None:
         """Stop; also in the middle of a mesh."""
         self._stopping.set()
         self._process.close()
         self._thread.join()
-        self._refuse_exports("the viewer is being closed")
+        self._refuse_export("the viewer is being closed")
 
     def _run(self) -> None:
         failures = 0
@@ -112,25 +118,24 @@ class BackgroundMap:
                     return
                 failures += 1
                 self._process.close()
-                self._refuse_exports("the process that makes the mesh has ended; try again")
+                self._refuse_export("the process that makes the mesh has ended; try again")
                 if failures > MAX_FAILURES:
                     logger.error("the process that makes the viewer's mesh ended too often")
                     return
                 logger.warning("the process that makes the viewer's mesh has ended: a new one")
                 self._known, self._process = {}, MapProcess()
 
-    def _refuse_exports(self, reason: str) -> None:
+    def _refuse_export(self, reason: str) -> None:
         with self._lock:
-            waiting, self._exports = self._exports, []
-        for _, _, future in waiting:
-            future.set_exception(MapError(reason))
+            wanted, self._wanted = self._wanted, None
+        if wanted is not None:
+            wanted[2].set_exception(MapError(reason))
 
     def _step(self) -> bool:
         """Do the most urgent thing; False when there is none."""
         with self._lock:
-            models, map_number = dict(self._models), self._map_number
-            exports, self._exports = self._exports, []
-        if not (exports or self._watched()):
+            models, map_number, wanted = dict(self._models), self._map_number, self._wanted
+        if wanted is None and not self._watched():
             return False
         if map_number != self._known_map:
             self._process.ask({"do": "forget"})
@@ -139,21 +144,31 @@ class BackgroundMap:
             self._scene.occupancy.set(None)
         for index, model in models.items():
             if self._known.get(index) != model.version:
-                self._process.ask({"do": "take", "name": f"region {index}"}, model.data)
-                self._known[index] = model.version
-        for resolution_m, suffix, future in exports:
-            self._export(resolution_m, suffix, future)
-        return bool(models) and (self._slice() or self._mesh(models))
+                self._hand_over(index, model)
+        if wanted is not None:
+            self._make_export(*wanted)
+        usable = {index: models[index] for index in models.keys() & self._known.keys()}
+        return bool(usable) and (self._slice() or self._mesh(usable))
 
-    def _export(self, resolution_m: float, suffix: str, future: Future[bytes]) -> None:
+    def _hand_over(self, index: RegionIndex, model: _Model) -> None:
+        """Give the process a region; one that it cannot use is left out until the next version."""
+        try:
+            self._process.ask({"do": "take", "name": f"region {index}"}, model.data)
+        except MapError as error:
+            logger.warning("the viewer leaves a region out: %s", error)
+            with self._lock:
+                if self._models.get(index) is model:
+                    del self._models[index]
+        else:
+            self._known[index] = model.version
+
+    def _make_export(self, resolution_m: float, suffix: str, future: Future[bytes]) -> None:
         request = {"do": "export", "resolution_m": resolution_m, "suffix": suffix}
         try:
             future.set_result(self._process.ask(request)[1])
         except MapError as error:
             future.set_exception(error)
-        except (EOFError, OSError):
-            future.set_exception(MapError("the process that makes the mesh has ended; try again"))
-            raise
+        self._wanted = None
 
     def _slice(self) -> bool:
         """Renew the occupancy if it is wanted and out of date."""
@@ -190,7 +205,8 @@ class BackgroundMap:
                 continue
             request = {"do": "mesh", "index": index, "resolution_m": resolution_m}
             answer, glb = self._process.ask(request)
-            surface = Surface(glb, answer["triangles"], model.version, resolution_m)
+            bounds = np.array(answer["bounds"])
+            surface = Surface(glb, answer["triangles"], bounds, model.version, resolution_m)
             if self._map_number == self._known_map:
                 self._scene.surfaces.set({**surfaces, index: surface})
             return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import struct
@@ -39,13 +40,10 @@ class Channel:
         header = json.loads(self._read(length))
         return header, [self._read(size) for size in header.pop(_SIZES)]
 
-    def close(self) -> None:
-        """Hang up; idempotent."""
-        try:
-            self._stream.close()
-        except OSError:
-            pass
-        self._socket.close()
+    def hang_up(self) -> None:
+        """Let both ends see that there will be nothing more; from any thread."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def _read(self, size: int) -> bytes:
         data = self._stream.read(size)

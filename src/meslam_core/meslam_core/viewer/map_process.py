@@ -11,8 +11,6 @@ from typing import Any
 from meslam_core.errors import MapError
 from meslam_core.viewer.channel import Channel
 
-ENDING_S = 5.0
-
 
 class MapProcess:
     """Starts `map_worker` and asks it; one thread at a time may use it."""
@@ -49,11 +47,8 @@ class MapProcess:
         return answer, block
 
     def close(self) -> None:
-        """End it, also in the middle of a request."""
-        self._channel.close()
-        self._process.terminate()
-        try:
-            self._process.wait(ENDING_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        """End it, also in the middle of a request, which another thread may wait for."""
+        self._channel.hang_up()
+        # It holds nothing that could be lost.
+        self._process.kill()
+        self._process.wait()

@@ -61,14 +61,17 @@ class MapWorker:
         return {}, b""
 
     def _mesh(self, request: dict[str, Any]) -> Answer:
-        """The mesh of one region, or of the whole map, as binary glTF; nothing where it is empty."""
+        """The mesh of one region as binary glTF; nothing where it is empty."""
         index: RegionIndex = tuple(request["index"])
-        mesh = extract_mesh(self._map(request["resolution_m"]), request["resolution_m"], regions=[index])
+        mesh = extract_mesh(
+            self._map(request["resolution_m"]), request["resolution_m"], regions=[index]
+        )
         if not len(mesh.triangles):
-            return {"triangles": 0}, b""
+            return {"triangles": 0, "bounds": np.zeros((2, 3)).tolist()}, b""
         buffer = io.BytesIO()
         write_glb(mesh, buffer)
-        return {"triangles": len(mesh.triangles)}, buffer.getvalue()
+        bounds = [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()]
+        return {"triangles": len(mesh.triangles), "bounds": bounds}, buffer.getvalue()
 
     def _layer(self, request: dict[str, Any]) -> Answer:
         """The cells of a slice as thick as they are."""
@@ -93,7 +96,7 @@ class MapWorker:
             near_m3 += len(region.observed_centers(near_surface=True)) * mask.voxel_m**3
         if near_m3 / resolution_m**3 > MAX_MESH_CELLS:
             raise MapError(
-                f"a mesh of {resolution_m} m is too fine for a map of this size; choose a coarser one"
+                f"a mesh of {resolution_m} m is too fine for this map; choose a coarser one"
             )
         return neural_map
 

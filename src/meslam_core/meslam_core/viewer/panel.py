@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from html import escape
 
@@ -27,20 +28,23 @@ LAYERS = {
     "online_path": "Path, live",
     "refined_path": "Path, refined",
 }
-MESH_RANGE_CM = (1.0, 20.0)
+SPACING_RANGE_CM = (1.0, 20.0)
 HEIGHT_RANGE_M = (-5.0, 5.0)
+JPEG_QUALITY = 70
+IMAGE_ORDER, TIMELINE_ORDER = 0.5, 0.7
 
 
 class Panel:
     """Controls that all who look have in common.
+
+    What a browser sends is checked here: it may be anything.
 
     Args:
         gui: of the server.
         controls: that follow the panel.
         show: called with a layer's name and whether it is to be seen.
         look_over: brings one viewer's eye back to where all is seen.
-        export: makes a file of the map, given the spacing [m] and the file's ending; None where
-            the map is not given away.
+        export: makes a file of the map, given the spacing [m] and the file's ending.
     """
 
     def __init__(
@@ -49,57 +53,28 @@ class Panel:
         controls: ViewControls,
         show: Callable[[str, bool], None],
         look_over: Callable[[viser.ClientHandle], None],
-        export: Callable[[float, str], bytes] | None,
+        export: Callable[[float, str], bytes],
     ) -> None:
         self._gui = gui
         self._controls = controls
+        self._show = show
+        self._look_over = look_over
+        self._export = export
         self._image: viser.GuiImageHandle | None = None
         self._status = gui.add_html(status_html(Scene()))
-        self.pause = gui.add_checkbox("Pause", False, hint="the page stands still")
-        self.follow = gui.add_checkbox("Follow the camera", False)
-        overview = gui.add_button("Overview", icon=viser.Icon.ZOOM_RESET)
-        overview.on_click(lambda event: event.client and look_over(event.client))
-        self.pause.on_update(lambda _: setattr(controls, "paused", self.pause.value))
-        self._add_layers(show)
-        self._add_mesh(export)
-
-    def _add_layers(self, show: Callable[[str, bool], None]) -> None:
-        gui, controls = self._gui, self._controls
+        self._pause = gui.add_checkbox("Pause", False, hint="the page stands still")
+        self._pause.on_update(self._take_pause)
+        self._follow = gui.add_checkbox("Follow the camera", False)
+        gui.add_button("Overview", icon=viser.Icon.ZOOM_RESET).on_click(self._take_overview)
         with gui.add_folder("Show"):
-            for name, label in LAYERS.items():
-                box = gui.add_checkbox(label, True)
-                box.on_update(
-                    lambda event, name=name: show(name, event.target.value)  # type: ignore[misc]
-                )
-            occupancy = gui.add_checkbox("Occupancy", controls.occupancy_shown)
-            height = gui.add_slider("Height [m]", *HEIGHT_RANGE_M, 0.05, controls.occupancy_height_m)
-
-        @occupancy.on_update
-        def _(_: object) -> None:
-            controls.occupancy_shown = occupancy.value
-            show("occupancy", occupancy.value)
-
-        @height.on_update
-        def _(_: object) -> None:
-            controls.occupancy_height_m = float(height.value)
-
-    def _add_mesh(self, export: Callable[[float, str], bytes] | None) -> None:
-        gui, controls = self._gui, self._controls
+            self._add_layers()
         with gui.add_folder("Mesh"):
-            spacing = gui.add_slider(
-                "Spacing [cm]", *MESH_RANGE_CM, 0.5, 100.0 * controls.mesh_resolution_m
-            )
-            if export is not None:
-                suffix = gui.add_dropdown("Format", FORMATS)
-                button = gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
-                button.on_click(
-                    lambda event: event.client
-                    and download(event.client, button, export, spacing.value / 100.0, suffix.value)
-                )
+            self._add_mesh()
 
-        @spacing.on_update
-        def _(_: object) -> None:
-            controls.mesh_resolution_m = spacing.value / 100.0
+    @property
+    def following(self) -> bool:
+        """Whether the eyes of all who look are to follow the camera."""
+        return self._follow.value is True
 
     def show_status(self, scene: Scene) -> None:
         """Renew what the panel says."""
@@ -108,31 +83,82 @@ class Panel:
     def show_image(self, image: NDArray[np.uint8]) -> None:
         """Show what the camera sees, (H, W, 3) uint8 RGB."""
         if self._image is None:
-            self._image = self._gui.add_image(image, format="jpeg", jpeg_quality=70, order=0.5)
+            self._image = self._gui.add_image(
+                image, format="jpeg", jpeg_quality=JPEG_QUALITY, order=IMAGE_ORDER
+            )
         else:
             self._image.image = image
 
+    def _add_layers(self) -> None:
+        gui = self._gui
+        for name, label in LAYERS.items():
+            self._add_layer(name, gui.add_checkbox(label, True))
+        self._occupancy = gui.add_checkbox("Occupancy", self._controls.occupancy_shown)
+        self._occupancy.on_update(self._take_occupancy)
+        self._height = gui.add_slider(
+            "Height [m]", *HEIGHT_RANGE_M, 0.05, self._controls.occupancy_height_m
+        )
+        self._height.on_update(self._take_occupancy)
 
-def download(
-    client: viser.ClientHandle,
-    button: viser.GuiButtonHandle,
-    export: Callable[[float, str], bytes],
-    resolution_m: float,
-    suffix: str,
-) -> None:
-    """Send the map's mesh to one viewer's browser, which saves it; nothing is written here."""
-    button.disabled = True
-    notice = client.add_notification("Mesh", f"made at {100 * resolution_m:g} cm", loading=True)
-    try:
-        content = export(resolution_m, suffix)
-    except MapError as error:
-        notice.remove()
-        client.add_notification("No mesh", str(error), color="red")
-        return
-    finally:
-        button.disabled = False
-    notice.remove()
-    client.send_file_download(f"meslam{suffix}", content, save_immediately=True)
+    def _add_layer(self, name: str, box: viser.GuiCheckboxHandle) -> None:
+        box.on_update(lambda _: self._show(name, box.value is True))
+
+    def _add_mesh(self) -> None:
+        gui = self._gui
+        self._spacing = gui.add_slider(
+            "Spacing [cm]", *SPACING_RANGE_CM, 0.5, 100.0 * self._controls.mesh_resolution_m
+        )
+        self._spacing.on_update(self._take_spacing)
+        self._suffix = gui.add_dropdown("Format", FORMATS)
+        self._download = gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
+        self._download.on_click(self._take_download)
+
+    def _take_pause(self, _: object) -> None:
+        self._controls.paused = self._pause.value is True
+
+    def _take_overview(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        if event.client is not None:
+            self._look_over(event.client)
+
+    def _take_occupancy(self, _: object) -> None:
+        shown = self._occupancy.value is True
+        self._show("occupancy", shown)
+        self._controls.occupancy_shown = shown
+        height_m = within(self._height.value, HEIGHT_RANGE_M)
+        if height_m is not None:
+            self._controls.occupancy_height_m = height_m
+
+    def _take_spacing(self, _: object) -> None:
+        spacing_cm = within(self._spacing.value, SPACING_RANGE_CM)
+        if spacing_cm is not None:
+            self._controls.mesh_resolution_m = spacing_cm / 100.0
+
+    def _take_download(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        """Send the map's mesh to one viewer's browser, which saves it; nothing is written here."""
+        suffix = self._suffix.value
+        if event.client is None or suffix not in FORMATS:
+            return
+        resolution_m = self._controls.mesh_resolution_m
+        self._download.disabled = True
+        notice = event.client.add_notification(
+            "Mesh", f"is made with a spacing of {100 * resolution_m:g} cm", loading=True
+        )
+        try:
+            content = self._export(resolution_m, suffix)
+        except MapError as error:
+            event.client.add_notification("No mesh", str(error), color="red")
+            return
+        finally:
+            notice.remove()
+            self._download.disabled = False
+        event.client.send_file_download(f"meslam{suffix}", content, save_immediately=True)
+
+
+def within(value: object, limits: tuple[float, float]) -> float | None:
+    """A number that a browser has sent, brought into its range; None for anything else."""
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return min(max(float(value), limits[0]), limits[1])
 
 
 def status_html(scene: Scene) -> str:

@@ -14,6 +14,8 @@ from meslam_core.regions.grid import RegionIndex
 from meslam_core.se3 import Pose
 
 T = TypeVar("T")
+# The first region's surroundings: a map begins at the origin.
+EMPTY_BOUNDS = np.array([[-1.5, -1.5, -1.2], [1.5, 1.5, 1.2]])
 
 
 class RegionState(Enum):
@@ -76,12 +78,14 @@ class Surface:
     Attributes:
         glb: binary glTF; empty where no surface was observed.
         triangles: number of them.
+        bounds: lowest and highest corner (2, 3), map frame [m]; zeros where it is empty.
         version: of the region that it shows.
         resolution_m: spacing of its vertices [m].
     """
 
     glb: bytes
     triangles: int
+    bounds: NDArray[np.float64]
     version: int
     resolution_m: float
 
@@ -189,12 +193,13 @@ class Scene:
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner (2, 3) of regions and paths, map frame [m]."""
-        points = [box.corners for box in self.regions.value]
+        """Lowest and highest corner (2, 3) of what there is to see, map frame [m]."""
+        points = [surface.bounds for surface in self.surfaces.value.values() if surface.glb]
+        points = points or [box.corners for box in self.regions.value]
         points += [self.online_path.value, self.refined_path.value]
         joined = np.concatenate(points)
         if not len(joined):
-            joined = np.array([[-1.5, -1.5, -1.0], [1.5, 1.5, 1.0]])
+            joined = EMPTY_BOUNDS
         return np.stack([joined.min(axis=0), joined.max(axis=0)])
 
 

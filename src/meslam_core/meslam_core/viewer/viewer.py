@@ -1,0 +1,102 @@
+"""The viewer: a page, and the background work that fills it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+from meslam_core.map.manifest import MANIFEST
+from meslam_core.map.store import MapStore
+from meslam_core.report.run_folder import read_run
+from meslam_core.results import MAP
+from meslam_core.viewer.background_map import BackgroundMap
+from meslam_core.viewer.page import Page
+from meslam_core.viewer.replay import Replay, map_status, region_boxes, run_status
+from meslam_core.viewer.scene import Scene, ViewControls
+from meslam_core.viewer.server import DEFAULT_HOST, DEFAULT_PORT
+
+
+class Viewer:
+    """A scene on a page, with the meshes of the models that it is given.
+
+    A context manager, which closes it.
+
+    Args:
+        host, port: where the page is served, as of `PageServer`.
+        controls: what is shown at first.
+        eager: make the mesh before somebody looks, too.
+
+    Raises:
+        ConfigError: when the address is not this computer's.
+    """
+
+    def __init__(
+        self,
+        host: str = DEFAULT_HOST,
+        port: int = DEFAULT_PORT,
+        controls: ViewControls | None = None,
+        eager: bool = False,
+    ) -> None:
+        self.scene = Scene()
+        self.controls = controls or ViewControls()
+        self.page = Page(self.scene, self.controls, host, port, self._export)
+        self.map = BackgroundMap(self.scene, self.controls, lambda: eager or self.page.viewers > 0)
+
+    def _export(self, resolution_m: float, suffix: str) -> bytes:
+        return self.map.export(resolution_m, suffix)
+
+    def close(self) -> None:
+        """Take the page away and end the background work."""
+        self.page.close()
+        self.map.close()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class FinishedRun:
+    """Shows what `meslam run` wrote, or a stored map alone, in a viewer.
+
+    Args:
+        viewer: to show it in.
+        path: of the run's folder or the map.
+        recording: where the images are, instead of where the run says.
+
+    Attributes:
+        missing: a sentence for everything that cannot be shown.
+
+    Raises:
+        EvaluationError: when the folder is not a run's or a file of it is damaged.
+        MapError: when nothing of the map can be read.
+        RecordingError: when the given recording cannot be read.
+    """
+
+    def __init__(self, viewer: Viewer, path: Path, recording: Path | None = None) -> None:
+        self._run = None if (path / MANIFEST).is_file() else read_run(path, recording=recording)
+        loaded = MapStore(path if self._run is None else path / MAP).load()
+        self.missing = list(loaded.warnings)
+        viewer.scene.regions.set(region_boxes(loaded))
+        status = map_status(loaded)
+        viewer.scene.status.set(status if self._run is None else run_status(self._run, status))
+        for region in loaded.regions:
+            viewer.map.take(region.index, region.version, loaded.encoded[region.index])
+        self._replay: Replay | None = None
+        if self._run is not None and self._run.refined is not None:
+            self._replay = Replay(viewer.scene, viewer.page, self._run)
+        if self._run is not None and self._run.recording is None:
+            self.missing += [line for line in self._run.missing if line.startswith("Camera images")]
+
+    def close(self) -> None:
+        """Release the recording."""
+        if self._replay is not None:
+            self._replay.close()
+        if self._run is not None:
+            self._run.close()

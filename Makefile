@@ -1,15 +1,16 @@
 # The words of the README. `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup build test demo faults lint format typecheck config clean
+.PHONY: help setup build test demo benchmark benchmark-quick faults lint format typecheck config clean
 
 RECORDING ?=
 PYTEST_ARGS ?=
+BENCHMARK_ARGS ?=
 FAULTS ?=
 IN_ENV := source env.bash &&
 
 help:  ## show this list
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */  make \1\t/' | expand -t 18
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/' | expand -t 24
 
 setup:  ## install and build everything; takes seconds when nothing has changed
 	@tools/setup.sh
@@ -25,6 +26,12 @@ demo: setup  ## map a simulated room, or RECORDING=path, with the real nodes; re
 
 faults: setup  ## inject all faults and write docs/reliability.md; FAULTS="input live" injects some
 	@$(IN_ENV) PYTHONPATH="test:$$PYTHONPATH" python -m faults $(FAULTS)
+
+benchmark: setup  ## every recording in MESLAM_DATA x every method: hours, resumable; docs/evaluation.md
+	@$(IN_ENV) python benchmarks/evaluation.py $(BENCHMARK_ARGS)
+
+benchmark-quick: setup  ## the same with few frames and one seed: ten minutes
+	@$(IN_ENV) python benchmarks/evaluation.py --quick $(BENCHMARK_ARGS)
 
 lint: setup  ## check style and formatting
 	@$(IN_ENV) ruff check . && ruff format --check .

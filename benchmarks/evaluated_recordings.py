@@ -25,6 +25,8 @@ SCENES: dict[str, float | None] = {
     "library": 30.0,
     "building": None,
 }
+# What the first seconds of the building show, a room and a corridor, others show as well.
+QUICK_SCENES = ("room", "corridor", "library")
 # Of the longest scene, the building.
 ROUND_S = 144.0
 KINECT_FPS = 30.0
@@ -70,10 +72,16 @@ class Source:
             simulated(self.scene, path, "--fps", str(SIMULATED_FPS), *length)
 
 
-def recorded(data: Path) -> list[Source]:
-    """What the folder MESLAM_DATA holds with true poses, TUM's sequences first."""
+def recorded(data: Path, quick: bool = False) -> list[Source]:
+    """What the folder MESLAM_DATA holds with true poses, TUM's sequences first.
+
+    Args:
+        data: the folder.
+        quick: of files in one folder, which share the truth, take the first.
+    """
     folders = sorted(path for path in data.iterdir() if path.is_dir())
-    found = [each for folder in folders for each in _in_folder(folder)]
+    by_folder = [list(_in_folder(folder)) for folder in folders]
+    found = [each for sources in by_folder for each in (sources[:1] if quick else sources)]
     return sorted(found, key=lambda source: not is_tum(source.sequence.recording))
 
 
@@ -101,10 +109,12 @@ def simulations(folder: Path, seconds: float | None = None) -> list[Source]:
 
     Args:
         folder: where they are kept.
-        seconds: at most so much of each scene; None for what SCENES says.
+        seconds: so much of each of QUICK_SCENES; None for all of what SCENES says.
     """
     sources = []
     for scene, usual_s in SCENES.items():
+        if seconds is not None and scene not in QUICK_SCENES:
+            continue
         duration_s = usual_s if seconds is None else seconds
         length = f"{duration_s:g}s" if duration_s else "round"
         path = folder / f"{scene}_{length}.mcap"

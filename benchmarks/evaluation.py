@@ -45,7 +45,7 @@ BASELINE = "imap_star"
 METHODS = ("meslam", *(name for name in PRESETS if name not in ("default", BASELINE)))
 METHODS = (*METHODS, BASELINE, *PEERS)
 QUICK_METHODS = ("meslam", BASELINE, *PEERS)
-QUICK_FRAMES, QUICK_BASELINE_FRAMES, QUICK_S = ":40", ":20", 3.0
+QUICK_FRAMES, QUICK_BASELINE_FRAMES, QUICK_S = ":40", ":15", 3.0
 # The baseline takes a large network through every frame, and is lost in large scenes anyway.
 BASELINE_FRAMES = ":300"
 # Frames a second and seconds besides, on two cores of a server: for what is left to wait.
@@ -54,8 +54,8 @@ USUAL = {
     "fine": (12.0, 16.0),
     "paper": (4.0, 25.0),
     "imap_star": (5.4, 30.0),
-    "tsdf": (7.0, 8.0),
-    "pose_graph": (8.0, 8.0),
+    "tsdf": (7.0, 9.0),
+    "pose_graph": (8.0, 9.0),
 }
 SIMULATED_FRAMES_S = 3.0
 
@@ -132,7 +132,7 @@ def cells_of(sources: list[Source], options: argparse.Namespace) -> list[Cell]:
 def sources_of(options: argparse.Namespace) -> list[Source]:
     """The recordings that are wanted."""
     data = os.environ.get("MESLAM_DATA")
-    found = recorded(Path(data).resolve()) if data else []
+    found = recorded(Path(data).resolve(), options.quick) if data else []
     found += simulations(CACHE.parent / "simulated", QUICK_S if options.quick else None)
     if options.recordings:
         names = {source.sequence.name for source in found}

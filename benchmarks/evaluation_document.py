@@ -67,7 +67,7 @@ online and from frame to frame, and must agree with our own evaluation to a micr
 stops. {evo}
 """
 DROP_IN = """\
-To make a row of it: download the sequence from the TUM RGB-D benchmark, unpack it into the folder
+To make such a row: download the sequence from the TUM RGB-D benchmark, unpack it into the folder
 that `MESLAM_DATA` names, and run `make benchmark`; it is found by its name.
 """
 
@@ -84,7 +84,8 @@ def write_document(results: Path, target: Path) -> None:
         shown = Path(os.path.relpath(picture, target.parent)).as_posix()
         sections.append(part_section(TITLES[stem], part, rows, shown))
     rows = rows_of(parts[FULL]["cells"]) if FULL in parts else {}
-    sections.append(trajectory_section(rows))
+    known = [cell["recording"] for part in parts.values() for cell in part["cells"]]
+    sections.append(trajectory_section(rows, list(dict.fromkeys(known))))
     sizes = results / "map_size.json"
     sections.append(size_section(json.loads(sizes.read_text()) if sizes.exists() else None))
     target.write_text("\n".join(sections))
@@ -113,7 +114,7 @@ def evo_statement(parts: Iterable[Mapping[str, Any]]) -> str:
     judged = [abs(ours - evo) for ours, evo in pairs if evo is not None]
     if not judged:
         return "Nothing has been judged yet."
-    told = f"The largest of {len(judged)} differences is {1e9 * max(judged):.3f} nm."
+    told = f"The largest of {len(judged)} differences is {1e9 * max(judged):.2g} nm."
     if missing := len(pairs) - len(judged):
         told += f" evo gives no answer to {missing} trajectories, of a camera that never moved."
     return told
@@ -192,12 +193,17 @@ def ranged(seeds: Sequence[Cell], name: str, factor: float, digits: int) -> str:
     return f"{told['median']} ({told['min']}-{told['max']})"
 
 
-def trajectory_section(rows: Rows) -> str:
-    """Ours beside the paper's Table I, where the sequence is the same."""
+def trajectory_section(rows: Rows, recordings: Sequence[str]) -> str:
+    """Ours beside the paper's Table I, where the sequence is the same.
+
+    Args:
+        rows: of all frames.
+        recordings: every one that was at hand.
+    """
     mine = {sequence_of(name): name for name, _ in rows if sequence_of(name)}
     lines = ["## Beside the paper's Table I", "", "ATE RMSE [cm]; published: Kruzhkov et al. 2022."]
     columns = ["method", *SEQUENCES]
-    body = [[f"{name}, published", *map(str, values)] for name, values in ATE_CM.items()]
+    body = [[published(name), *map(str, values)] for name, values in ATE_CM.items()]
     for method, name in NAMES.items():
         if any((recording, method) in rows for recording in mine.values()):
             chosen = [rows.get((mine.get(each, ""), method), []) for each in SEQUENCES]
@@ -208,10 +214,10 @@ def trajectory_section(rows: Rows) -> str:
             f"Of the paper's sequences, {', '.join(missing)} were not at hand here. ",
             DROP_IN,
         ]
-    others = dict.fromkeys(name for name, _ in rows if tum_name(name) and not sequence_of(name))
+    others = [name for name in recordings if tum_name(name) and not sequence_of(name)]
     if others:
-        told = ", ".join(f"{name} ({tum_name(name)})" for name in others)
-        lines += [f"The paper has no figures of the TUM sequences that were: {told}.", ""]
+        told = ", ".join(f"{name} (TUM's {tum_name(name)})" for name in others)
+        lines += [f"The paper has no figures of the TUM sequences that were at hand: {told}.", ""]
     return "\n".join(lines)
 
 
@@ -219,7 +225,7 @@ def size_section(sizes: Mapping[str, Any] | None) -> str:
     """Ours beside the paper's Table II, out of the benchmark of map sizes."""
     lines = ["## Beside the paper's Table II", "", "Map [MB] of 57 m³ seen for longer and longer."]
     columns = ["method", *(f"{seconds} s" for seconds in MAP_SECONDS)]
-    body = [[f"{name}, published", *map(str, values)] for name, values in MAP_MB.items()]
+    body = [[published(name), *map(str, values)] for name, values in MAP_MB.items()]
     if sizes is not None:
         for method in dict.fromkeys(row["method"] for row in sizes["rows"]):
             by_time = {row["seconds"]: row for row in sizes["rows"] if row["method"] == method}
@@ -234,6 +240,11 @@ def size_section(sizes: Mapping[str, Any] | None) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def published(name: str) -> str:
+    """A row of the paper's."""
+    return f"{name}, published".replace("*", "\\*")
 
 
 def table(columns: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:

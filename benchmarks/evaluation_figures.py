@@ -23,7 +23,7 @@ COLORS = {
 }
 # Figure, its label, factor, whether the scale is logarithmic, and where bars end.
 PANELS: tuple[tuple[str, str, float, bool, float], ...] = (
-    ("ate_m", "ATE, refined [cm], cut off", CENTIMETRES, False, HIGHEST_BAR_CM),
+    ("ate_m", f"ATE, refined [cm], to {HIGHEST_BAR_CM:g}", CENTIMETRES, False, HIGHEST_BAR_CM),
     ("fps", "frames a second", 1.0, False, np.inf),
     ("peak_rss_mb", "peak memory [MB]", 1.0, False, np.inf),
     ("map_bytes", "map [kB]", 1e-3, True, np.inf),

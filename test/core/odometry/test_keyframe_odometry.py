@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from data.textured_room import frame_at, path
@@ -104,3 +106,26 @@ def test_what_fits_nowhere_is_reported():
     estimate = second_estimate(Scripted([], far, agreement=0.2))
     assert not estimate.valid
     assert "20%" in estimate.reason
+
+
+@pytest.mark.parametrize(
+    ("elapsed_s", "distance_m", "valid"), [(0.6, 0.7, True), (1.5, 0.3, True), (1.5, 0.7, False)]
+)
+def test_a_far_motion_over_a_gap_is_a_guess(elapsed_s, distance_m, valid):
+    """Two views that share little fit in several ways; what fits best is still the best guess."""
+    registrar = Scripted([exp(np.array([distance_m, 0.0, 0.0, 0.0, 0.0, 0.0]))], TRUE)
+    registrar.true = exp(np.array([distance_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    registrar.basin_m = 0.1
+    registrar._bad = {"fitness": 0.0, "agreement": 0.0}
+    config = MeslamConfig()
+    follower = KeyframeOdometry(registrar, config.odometry, config.sensor)
+    follower.process(FRAMES[0])
+    late_ns = FRAMES[0].stamp_ns + round(elapsed_s * 1e9)
+    estimate = follower.process(replace(FRAMES[1], stamp_ns=late_ns))
+    assert estimate.valid is valid
+    assert (estimate.reason == "") is valid
+    np.testing.assert_allclose(estimate.T_odom_camera, registrar.true, atol=1e-9)
+    # From there odometry goes on.
+    registrar.true = np.eye(4)
+    after = follower.process(replace(FRAMES[2], stamp_ns=late_ns + 66_000_000))
+    assert after.valid

@@ -143,3 +143,35 @@ def test_without_odometry_a_poor_fit_is_not_trained(mapped_room):
     tracked = tracking.track(3 * PERIOD_NS, mapped_room.region, rays, odometry(valid=False))
     assert tracking.state is TrackingState.DEGRADED
     assert not tracked.trusted
+
+
+@pytest.mark.parametrize("refutes", [False, True])
+def test_without_odometry_a_view_off_the_map_that_keyframes_know_is_looked_for_at_once(
+    mapped_room, refutes
+):
+    tracking, here = adrift(mapped_room), mapped_room.poses[0]
+    known = here @ exp(np.array([0.5 * refutes, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    rays = whole_view(mapped_room, share=0.2)
+    tracked = tracking.track(
+        3 * PERIOD_NS, mapped_room.region, rays, odometry(valid=False), lambda before: known
+    )
+    assert tracking.state is TrackingState.LOST
+    assert not tracked.trusted
+    assert "points lie on the map" in tracked.reason
+    # What was mapped since is wrong only where the camera is not where it seemed to be.
+    assert tracking.take_refuted() == (len(mapped_room.keyframes) if refutes else None)
+
+
+def test_odometry_that_is_only_a_guess_still_tells_where_to_look(mapped_room):
+    motion = exp(np.array([0.3, 0.0, 0.1, 0.0, 0.15, 0.0]))
+    start = mapped_room.poses[0] @ np.linalg.inv(motion)
+
+    def error_m(T_odom_camera) -> float:
+        tracking = adrift(mapped_room)
+        tracking.history.add(3 * PERIOD_NS, start, 0, np.linalg.inv(motion), odometry(valid=True))
+        guess = OdometryEstimate(0, T_odom_camera, np.eye(6), 1.0, 0.0, valid=False)
+        tracked = tracking.track(25 * PERIOD_NS, mapped_room.region, whole_view(mapped_room), guess)
+        return float(np.linalg.norm((tracked.T_map_camera - mapped_room.poses[0])[:3, 3]))
+
+    assert error_m(motion) < 0.02
+    assert error_m(np.eye(4)) > 0.1

@@ -23,7 +23,7 @@ from meslam_core.se3 import Pose
 # frames make up for the rest, so many steps each.
 FIRST_STEPS_SHARE = 0.4
 MADE_UP_A_FRAME = 40
-# `mapping.min_iterations` are of frames that follow each other within so long [s]; a frame that comes
+# `mapping.min_iterations` are of frames that follow each other within so long [s]; one that comes
 # later stands for those that were passed over, and what it shows anew takes their steps, too.
 FRAME_PERIOD_S = 1.0 / 15.0
 # A region that knows its box is trained beside another one at this share of the

@@ -49,8 +49,8 @@ class OdometryEstimate:
         covariance: (6, 6) of (translation [m], rotation [rad]) of the last motion, camera frame.
         fitness: share of points with a correspondence, in [0, 1].
         residual_m: RMS distance of the correspondences [m].
-        valid: whether the registration passed its checks; an invalid one continues the last
-            motion and must not be trusted.
+        valid: whether the registration passed its checks; an invalid one is a guess, mostly the
+            last motion continued, and must not be trusted.
         reason: why it is invalid, empty otherwise.
         noise: of odometry from elsewhere, any two valid estimates of which tell a motion, whatever
             came between. None for what is registered here from frame to frame: the motion from or

@@ -160,7 +160,11 @@ class FrameHistory:
 
         None where there is no valid odometry to go by.
         """
-        if odometry is None or not odometry.valid or not self._measured:
+        return self.guessed(odometry) if odometry is not None and odometry.valid else None
+
+    def guessed(self, odometry: OdometryEstimate | None) -> tuple[Pose, Pose] | None:
+        """The same of odometry that may be wrong."""
+        if odometry is None or not self._measured:
             return None
         last = self._measured[-1]
         if self._count - last.number > MAX_ODOMETRY_GAP or last.number < self._begun:

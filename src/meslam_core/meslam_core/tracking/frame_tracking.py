@@ -244,7 +244,7 @@ class FrameTracking:
         if not len(self.history):
             return [self._T_map_first.copy()]
         guesses = []
-        moved = self.history.moved(odometry)
+        moved = self.history.guessed(odometry)
         if moved is not None:
             guesses.append(moved[0] @ moved[1])
         guesses.append(self.history.extrapolated(stamp_ns))

@@ -69,28 +69,52 @@ class Judge:
         witness: Witness,
     ) -> Verdict:
         """Whether an alignment may be trusted, or odometry in its place."""
-        limits, path = self._config, self._path
-        if not np.isfinite(alignment.T_map_camera).all():
-            return Verdict(trusted=False, reason="the pose is not finite")
-        if alignment.observed_ratio < limits.min_observed_ratio:
+        path = self._path
+        unmapped = self._unmapped(alignment)
+        if unmapped and path.followed:
             # Beyond what is mapped only odometry knows; without it the map could not grow.
-            return Verdict(
-                trusted=path.followed,
-                reason=f"only {alignment.observed_ratio:.0%} of the view is mapped",
-            )
-        if alignment.inlier_ratio < limits.min_inlier_ratio:
-            share = f"{alignment.inlier_ratio:.0%}"
-            return Verdict(trusted=False, reason=f"only {share} of the points lie on the map")
-        if alignment.residual_m > limits.max_residual_m:
-            distance = f"{alignment.residual_m * 100:.1f} cm"
-            return Verdict(trusted=False, reason=f"points lie {distance} off the map")
-        pose = alignment.T_map_camera
-        objection = path.impossible(stamp_ns, pose) or path.conflict(prior, pose)
+            return Verdict(trusted=True, reason=unmapped)
+        objection = unmapped or self._objection(stamp_ns, alignment, prior)
         if objection:
-            return Verdict(trusted=False, reason=objection)
+            return self._refused(prior, witness, objection)
         if not path.doubted or path.certain(region, rays, alignment):
             return Verdict(trusted=True, confirmed=True)
         return self._adrift(region, rays, alignment, witness)
+
+    def _unmapped(self, alignment: Alignment) -> str:
+        """Whether the map cannot tell, for it ends before the camera: what is said then."""
+        finite = np.isfinite(alignment.T_map_camera).all()
+        if not finite or alignment.observed_ratio >= self._config.min_observed_ratio:
+            return ""
+        return f"only {alignment.observed_ratio:.0%} of the view is mapped"
+
+    def _objection(self, stamp_ns: int, alignment: Alignment, prior: PosePrior) -> str:
+        """Why an alignment cannot be right; empty where it can."""
+        limits, pose = self._config, alignment.T_map_camera
+        if not np.isfinite(pose).all():
+            return "the pose is not finite"
+        if alignment.inlier_ratio < limits.min_inlier_ratio:
+            return f"only {alignment.inlier_ratio:.0%} of the points lie on the map"
+        if alignment.residual_m > limits.max_residual_m:
+            return f"points lie {alignment.residual_m * 100:.1f} cm off the map"
+        return self._path.impossible(stamp_ns, pose) or self._path.conflict(prior, pose)
+
+    def _refused(self, prior: PosePrior, witness: Witness, objection: str) -> Verdict:
+        """An alignment is not to be trusted; after odometry has failed keyframes may know more."""
+        path = self._path
+        known = witness(path.adrift_since) if path.doubted and path.asks() else None
+        if known is None:
+            return Verdict(trusted=False, reason=objection)
+        distance, angle = motion_between(known, prior.T_map_camera)
+        if not self._agree(distance, angle) and not path.drifted(distance, angle):
+            self.refuted_since = path.adrift_since
+        reason = f"{objection}; the view is known from {distance:.2f} m away"
+        return Verdict(trusted=False, elsewhere=True, reason=reason)
+
+    def _agree(self, distance_m: float, angle_rad: float) -> bool:
+        """Whether two poses so far apart are the same place."""
+        limits = self._relocalisation
+        return distance_m <= limits.agreement_m and angle_rad <= np.deg2rad(limits.agreement_deg)
 
     def _adrift(
         self, region: Region, rays: Rays, alignment: Alignment, witness: Witness
@@ -100,8 +124,7 @@ class Judge:
         known = witness(path.adrift_since) if path.asks() else None
         if known is not None:
             distance, angle = motion_between(known, alignment.T_map_camera)
-            limits = self._relocalisation
-            if distance <= limits.agreement_m and angle <= np.deg2rad(limits.agreement_deg):
+            if self._agree(distance, angle):
                 return Verdict(trusted=True, confirmed=True)
             if not path.drifted(distance, angle):
                 self.refuted_since = path.adrift_since

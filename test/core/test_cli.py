@@ -367,6 +367,17 @@ def test_info_describes_a_recording(folder):
     assert "frames" in meslam("info", folder).stdout
 
 
+def test_a_full_disk_behind_standard_output_is_told(folder):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*MESLAM, "info", str(folder)], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert done.returncode == 2
+    assert done.stderr.startswith("meslam: ")
+    assert "No space left" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_info_describes_a_map(stored_map):
     facts = json.loads(meslam("info", stored_map, "--json").stdout)
     assert facts["regions"] == 1

@@ -133,3 +133,10 @@ def test_the_reference_lists_every_setting():
     text = config_reference.documents()["docs/parameters.md"]
     for setting in settings():
         assert f"| `{setting.path}` |" in text
+
+
+def test_a_range_of_depth_that_is_empty_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"sensor\.min_depth_m = 4 m .* sensor\.max_depth_m = 1 m"
+    ):
+        MeslamConfig.from_overrides(["sensor.min_depth_m=4", "sensor.max_depth_m=1"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 
 import pytest
 
@@ -102,3 +103,12 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
     assert (tmp_path / TRAJECTORY).read_text() == "mine"
     with ResultFolder(tmp_path):
         pass
+
+
+def test_a_folder_that_vanishes_meanwhile_is_made_again(tmp_path):
+    with ResultFolder(tmp_path / "out") as results:
+        shutil.rmtree(tmp_path / "out")
+        fill(results, "in spite of all")
+        results.publish()
+    assert (tmp_path / "out" / TRAJECTORY).read_text() == "in spite of all"
+    assert not list((tmp_path / "out").glob(".*"))

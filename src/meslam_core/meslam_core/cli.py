@@ -7,6 +7,7 @@ user interrupted a run. Messages go to standard error, results to standard outpu
 
 from __future__ import annotations
 
+import errno
 import logging
 import re
 import shlex
@@ -54,6 +55,12 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except MeslamError as error:
             complain(str(error))
+            raise typer.Exit(BAD_INPUT) from error
+        except OSError as error:
+            # Whoever reads what is printed may have gone; that is no one's error.
+            if error.errno == errno.EPIPE:
+                raise
+            complain(f"the system refuses: {error}; free what it lacks and try again")
             raise typer.Exit(BAD_INPUT) from error
 
 

@@ -94,7 +94,9 @@ class ResultFolder:
         self._clean()
 
     def incomplete(self, name: str) -> Path:
-        """Where to write a result until `publish`."""
+        """Where to write a result until `publish`; made again where somebody removed it."""
+        with contextlib.suppress(OSError):
+            self._staging.mkdir(parents=True, exist_ok=True)
         return self._staging / name
 
     def write_report(self, entries: Mapping[str, Any]) -> None:

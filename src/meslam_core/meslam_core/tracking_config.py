@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from meslam_core.errors import ConfigError
 from meslam_core.setting import setting
 
 
@@ -23,6 +24,13 @@ class SensorConfig:
         minimum=0.005,
         maximum=1.0,
     )
+
+    def __post_init__(self) -> None:
+        if self.min_depth_m >= self.max_depth_m:
+            raise ConfigError(
+                f"sensor.min_depth_m = {self.min_depth_m:g} m is not below sensor.max_depth_m = "
+                f"{self.max_depth_m:g} m: no depth would be believed"
+            )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -11,12 +13,14 @@ import numpy as np
 import pytest
 from data.bag_builder import (
     ALIGNED_DEPTH,
+    ALIGNED_DEPTH_INFO,
     COLOR,
     COLOR_INFO,
     DEPTH,
     DEPTH_FRAME,
     DEPTH_INFO,
     BagBuilder,
+    Storage,
     aligned_bag,
 )
 from data.synthetic_frames import (
@@ -38,6 +42,15 @@ def image_pair(builder: BagBuilder, depth_topic: str = ALIGNED_DEPTH, frame_id: 
     frame = plane_frame(0)
     builder.image(COLOR, frame.stamp_ns, frame.color, "rgb8", "a")
     builder.image(depth_topic, frame.stamp_ns, depth_mm(frame), "16UC1", frame_id)
+
+
+def test_names_that_are_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    for place in (tmp_path / "pipe.mcap", Path("/dev/zero")):
+        with pytest.raises(RecordingError, match="no file and no folder"):
+            open_recording(place)
+    with pytest.raises(RecordingError, match="too long"):
+        open_recording(tmp_path / ("long" * 100))
 
 
 def test_missing_file_and_unknown_things(tmp_path: Path) -> None:
@@ -177,6 +190,24 @@ def test_wrong_encoding(tmp_path: Path) -> None:
     recording = open_recording(path, topics=RecordingTopics(color=COLOR))
     with pytest.raises(RecordingError, match=r"frame 0.*encoding 'bayer_rggb8'; expected one of"):
         list(recording.frames())
+
+
+@pytest.mark.parametrize("storage", ["mcap", "bag"])
+def test_a_camera_info_that_changes_is_told_once(
+    tmp_path: Path, storage: Storage, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = plane_frames(6)
+    for number in (3, 4):
+        camera = replace(frames[number].camera, fx=45.0)
+        frames[number] = replace(frames[number], camera=camera)
+    recording = open_recording(aligned_bag(frames, tmp_path, storage))
+    assert len(list(recording.frames())) == 6
+    recording.close()
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 2
+    for topic in (COLOR_INFO, ALIGNED_DEPTH_INFO):
+        assert sum(f"{topic} changes at" in each for each in told) == 1
+    assert all("fx 30.0 to 45.0" in each for each in told)
 
 
 def test_camera_info_missing_or_without_intrinsics(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from meslam_core.errors import MapError, OutputError
+from meslam_core.input_file import read_file
 from meslam_core.map import codec
 from meslam_core.map.files import (
     TEMPORARY_SUFFIX,
@@ -154,7 +155,7 @@ class MapStore:
     def _holds(self, entry: RegionEntry) -> bool:
         """Whether a region's file is there with the right content."""
         try:
-            data = (self.path / entry.file).read_bytes()
+            data = read_file(self.path / entry.file, codec.MAX_FILE_BYTES)
         except OSError:
             return False
         return hashlib.sha256(data).hexdigest() == entry.sha256

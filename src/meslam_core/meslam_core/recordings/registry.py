@@ -36,9 +36,12 @@ def open_recording(
             intrinsics; the message says what to do.
     """
     path = Path(path)
-    if not path.exists():
-        raise RecordingError(f"{path} does not exist; expected {_ACCEPTED}")
     try:
+        if not path.exists():
+            raise RecordingError(f"{path} does not exist; expected {_ACCEPTED}")
+        if not path.is_dir() and not path.is_file():
+            # A pipe would be waited for, and a device has no end.
+            raise RecordingError(f"{path} is no file and no folder; expected {_ACCEPTED}")
         if path.is_dir() and is_tum(path):
             return open_tum(path, camera)
         if path.is_dir() and is_folder(path):

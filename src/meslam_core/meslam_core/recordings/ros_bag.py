@@ -16,6 +16,7 @@ from meslam_core import se3
 from meslam_core.camera import PinholeCamera, register_depth_to_color
 from meslam_core.errors import FrameError, RecordingError
 from meslam_core.frame import RgbdFrame, depth_to_metres
+from meslam_core.recordings.calibration_watch import CalibrationWatch
 from meslam_core.recordings.images import color_from_message, depth_from_message
 from meslam_core.recordings.lens import Lens
 from meslam_core.recordings.messages import MessageSource
@@ -98,6 +99,8 @@ class RosBagRecording:
         self.topics = {role: topic for role, topic in vars(chosen).items() if topic is not None}
         self._color_topic, self._depth_topic = chosen.color, chosen.depth
         self._camera_given = camera is not None
+        infos = {chosen.depth_info, None if self._camera_given else chosen.color_info}
+        self._calibration_watch = CalibrationWatch(self.name, source, infos - {None})
         if camera is not None:
             self._camera, self._lens = camera, Lens(camera)
         else:
@@ -198,7 +201,11 @@ class RosBagRecording:
         arrivals: dict[str, list[int]] = {self._color_topic: [], self._depth_topic: []}
         damage = None
         try:
-            for arrival, (topic, time_ns, raw) in enumerate(self._source.messages(list(stamps))):
+            topics = {*stamps, *self._calibration_watch.topics}
+            for arrival, (topic, time_ns, raw) in enumerate(self._source.messages(topics)):
+                if topic not in stamps:
+                    self._calibration_watch.see(topic, time_ns, raw)
+                    continue
                 stamps[topic].append(self._source.stamp_ns(raw))
                 times[topic].append(time_ns)
                 arrivals[topic].append(arrival)

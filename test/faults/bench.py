@@ -37,10 +37,15 @@ class Ended:
         return "" if self.status == 0 or self.message else f"exit status {self.status} in silence"
 
     @property
+    def lines(self) -> list[str]:
+        """The lines for people on standard error."""
+        own = [line for line in self.stderr.splitlines() if line.startswith(("meslam: ", "Error"))]
+        return [line.removeprefix("meslam: ") for line in own]
+
+    @property
     def message(self) -> str:
         """The last line for people on standard error; empty where there is none."""
-        lines = [line for line in self.stderr.splitlines() if line.startswith(("meslam: ", "Erro"))]
-        return lines[-1].removeprefix("meslam: ") if lines else ""
+        return self.lines[-1] if self.lines else ""
 
 
 class Bench:

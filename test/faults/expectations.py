@@ -12,16 +12,31 @@ from faults.fault import Seen
 from faults.material import QUICK, Shot, record, shots, truth
 
 Problem = Callable[[Seen], str]
+LOST, BAD_INPUT, INTERRUPTED = 3, 2, 130
 
 
-def run(bench: Bench, recording: Path, *options: object) -> Seen:
-    """Track and map a recording with the command, and compare it with the walk's truth."""
+def run(bench: Bench, recording: Path, *options: object, **how: Any) -> Seen:
+    """Track and map a recording with the command, and compare it with the truth.
+
+    Args:
+        bench: where; `truth.txt` in its folder, else the walk's, is the truth.
+        recording: what.
+        options: further ones of the command line.
+        how: passed to `Bench.meslam`.
+    """
     out = bench.folder / "results"
-    ended = bench.meslam("run", recording, "--out", out, "--truth", truth(bench), *QUICK, *options)
-    report: dict[str, Any] = {}
-    if (out / "report.json").exists():
-        report = json.loads((out / "report.json").read_text())
-    return seen_of(bench, ended, report=report)
+    own = bench.folder / "truth.txt"
+    compared = own if own.exists() else truth(bench)
+    ended = bench.meslam(
+        "run", recording, "--out", out, "--truth", compared, *QUICK, *options, **how
+    )
+    return seen_of(bench, ended, report=report_in(out))
+
+
+def report_in(out: Path) -> dict[str, Any]:
+    """What a run reported; empty where it did not."""
+    file = out / "report.json"
+    return dict(json.loads(file.read_text())) if file.exists() else {}
 
 
 def seen_of(bench: Bench, *ended: Ended, **facts: Any) -> Seen:
@@ -35,10 +50,14 @@ def seen_of(bench: Bench, *ended: Ended, **facts: Any) -> Seen:
     for each in ended:
         if each.status != 0 or not report:
             told.append(f"exit status {each.status}")
-        told += [line.removeprefix("meslam: ") for line in each.stderr.splitlines()
-                 if line.startswith("meslam: ")][-2:]  # fmt: skip
+        told += each.lines[-2:]
     words = ", ".join(told).replace(f"{bench.folder}/", "").replace(f"{bench.cache}/", "")
     return Seen(words, {"ended": ended, **facts})
+
+
+def command(*arguments: object) -> Callable[[Bench], Seen]:
+    """Run the command with arguments that need nothing."""
+    return lambda bench: seen_of(bench, bench.meslam(*arguments))
 
 
 def walked(change: Callable[[list[Shot]], object], *options: object) -> Callable[[Bench], Seen]:
@@ -53,11 +72,11 @@ def walked(change: Callable[[list[Shot]], object], *options: object) -> Callable
     return inject
 
 
-def each(change: Callable[[Shot], object]) -> Callable[[list[Shot]], None]:
-    """A change of every shot."""
+def each(change: Callable[[Shot], object], start: int = 0, stop: int | None = None) -> Any:
+    """A change of every shot from one number to another."""
 
     def all_of_them(taken: list[Shot]) -> None:
-        for shot in taken:
+        for shot in taken[start:stop]:
             change(shot)
 
     return all_of_them
@@ -68,10 +87,8 @@ def tracked(at_least: int, *words: str, within_m: float = 0.02, status: int = 0)
 
     def problem(seen: Seen) -> str:
         report, (ended,) = seen.facts["report"], seen.facts["ended"]
-        if ended.unexplained:
-            return ended.unexplained
-        if ended.status != status:
-            return f"exit status {ended.status} instead of {status}: {ended.message}"
+        if told := _wrong_end(ended, status):
+            return told
         if report["frames_tracked"] < at_least:
             return f"{report['frames_tracked']} frames tracked, expected {at_least}"
         off_m = report.get("ate_online_rmse_m")
@@ -84,17 +101,41 @@ def tracked(at_least: int, *words: str, within_m: float = 0.02, status: int = 0)
     return problem
 
 
-def refused(*words: str, status: int = 2) -> Problem:
+def ended(*words: str, status: int = 0) -> Problem:
+    """Every process ends with a status, and standard error has all words."""
+
+    def problem(seen: Seen) -> str:
+        for each in seen.facts["ended"]:
+            if told := _wrong_end(each, status) or missing(each.stderr, words):
+                return told
+        return ""
+
+    return problem
+
+
+def untracked(*words: str) -> Problem:
+    """The run ends as lost, without a single pose or a map, and says why."""
+
+    def problem(seen: Seen) -> str:
+        if told := ended(*words, status=LOST)(seen):
+            return told
+        report = seen.facts["report"]
+        return "poses of nothing" if report["frames_tracked"] or report["map_bytes"] else ""
+
+    return problem
+
+
+def broke_off(frames: int, *words: str) -> Problem:
+    """The command says where the recording breaks off, and has the results of what came before."""
+    return tracked(frames, "breaks off", *words, status=BAD_INPUT)
+
+
+def refused(*words: str) -> Problem:
     """The command ends with a message that has all words, and leaves no result."""
 
     def problem(seen: Seen) -> str:
-        for ended in seen.facts["ended"]:
-            if ended.unexplained:
-                return str(ended.unexplained)
-            if ended.status != status:
-                return f"exit status {ended.status} instead of {status}: {ended.message}"
-            if told := missing(ended.stderr, words):
-                return told
+        if told := ended(*words, status=BAD_INPUT)(seen):
+            return told
         return "results of a refused input" if seen.facts.get("report") else ""
 
     return problem
@@ -104,3 +145,11 @@ def missing(text: str, words: tuple[str, ...]) -> str:
     """Which words a text lacks; empty where it has all."""
     lacks = [word for word in words if word.lower() not in text.lower()]
     return f"not told: {', '.join(lacks)}" if lacks else ""
+
+
+def _wrong_end(ended: Ended, status: int) -> str:
+    if ended.unexplained:
+        return ended.unexplained
+    if ended.status != status:
+        return f"exit status {ended.status} instead of {status}: {ended.message}"
+    return ""

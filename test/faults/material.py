@@ -58,6 +58,7 @@ class Shot:
         color: (H, W, 3) uint8, RGB, or what a fault makes of it; None for no image.
         depth: (H, W) uint16 [mm] or float32 [m]; None for no image.
         camera: what the camera infos say; None for no message.
+        T_map_camera: true pose (4, 4).
         recorded_ns: when it arrived; by default its stamp.
     """
 
@@ -65,6 +66,7 @@ class Shot:
     color: NDArray[Any] | None
     depth: NDArray[Any] | None
     camera: PinholeCamera | None
+    T_map_camera: Pose
     color_encoding: str = "rgb8"
     depth_encoding: str = ""
     recorded_ns: int | None = None
@@ -95,14 +97,16 @@ def shots() -> list[Shot]:
             frame.color.copy(),
             np.rint(frame.depth_m * 1000).astype(np.uint16),
             frame.camera,
+            pose,
         )
-        for frame in frames()
+        for frame, pose in zip(frames(), poses(), strict=True)
     ]
 
 
 def record(taken: list[Shot], folder: Path, storage: Storage = "mcap") -> Path:
-    """Write shots as realsense2_camera's topics; returns the recording."""
+    """Write shots as realsense2_camera's topics, and `truth.txt`; returns the recording."""
     folder.mkdir(parents=True, exist_ok=True)
+    write_truth(taken, folder / "truth.txt")
     builder = BagBuilder(ros1=storage == "bag")
     for shot in taken:
         when = shot.stamp_ns if shot.recorded_ns is None else shot.recorded_ns
@@ -115,6 +119,13 @@ def record(taken: list[Shot], folder: Path, storage: Storage = "mcap") -> Path:
             encoding = shot.depth_encoding or ("32FC1" if shot.depth.dtype.kind == "f" else "16UC1")
             builder.image(ALIGNED_DEPTH, shot.stamp_ns, shot.depth, encoding, COLOR_FRAME, when)
     return builder.write(folder, storage)
+
+
+def write_truth(taken: list[Shot], file: Path) -> None:
+    """Write the true poses of shots, the first one of each stamp, as TUM text."""
+    first = {shot.stamp_ns: shot.T_map_camera for shot in reversed(taken)}
+    stamps = sorted(first)
+    write_tum(file, Trajectory(np.array(stamps), np.array([first[stamp] for stamp in stamps])))
 
 
 def shared(bench: Bench, name: str, make: Callable[[Path], object]) -> Path:
@@ -159,13 +170,9 @@ def folder(bench: Bench) -> Path:
 
 
 def truth(bench: Bench) -> Path:
-    """The true poses of the walk as TUM text."""
-    stamps = np.array([frame.stamp_ns for frame in frames()])
-
-    def make(target: Path) -> None:
-        write_tum(target / "truth.txt", Trajectory(stamps, np.array(poses())))
-
-    return shared(bench, "truth", make) / "truth.txt"
+    """The true poses of the walk as TUM text; shared."""
+    folder = shared(bench, "truth", lambda target: write_truth(shots(), target / "truth.txt"))
+    return folder / "truth.txt"
 
 
 def stored_map(bench: Bench) -> Path:

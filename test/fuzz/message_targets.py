@@ -20,6 +20,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
 from meslam_core import se3
+from meslam_core.camera import register_depth_to_color
 from meslam_core.config import MeslamConfig
 from meslam_core.errors import FrameError
 from meslam_core.map import codec
@@ -156,7 +157,9 @@ def _info(parts: Parts, folder: Path) -> str:
     camera = camera_from_info(message, "/camera_info")
     lens = Lens(camera, message.distortion_model, message.d)
     if camera.width * camera.height < 10**6:
-        lens.undistort_depth(np.ones((camera.height, camera.width), np.float32))
+        depth_m = lens.undistort_depth(np.ones((camera.height, camera.width), np.float32))
+        register_depth_to_color(depth_m, camera, CAMERA, np.eye(4))
+        register_depth_to_color(np.ones((24, 32), np.float32), CAMERA, camera, np.eye(4))
     return f"{message.distortion_model} {len(message.d)}"
 
 

@@ -20,6 +20,7 @@ from meslam_core.config import PRESETS, MeslamConfig, OdometryConfig
 from meslam_core.continuation import read_start_pose
 from meslam_core.errors import ConfigError, EvaluationError
 from meslam_core.evaluation.report import trajectory_entries
+from meslam_core.frame_log import COLUMNS, read_frame_log
 from meslam_core.odometry import GivenOdometry
 from meslam_core.pose_covariance import PoseCovariances, read_covariances, write_covariances
 from meslam_core.recordings.image_files import CameraFile
@@ -88,6 +89,21 @@ def _covariances(parts: Parts, folder: Path) -> str:
     assert np.isfinite(covariances.matrices).all()
     write_covariances(folder / "again.txt", covariances)
     return str(len(covariances))
+
+
+def _log_seeds() -> list[Parts]:
+    lines = [",".join(COLUMNS)]
+    for number in range(3):
+        values = [f"{number}.5", "OK", "", *("0.25" for _ in COLUMNS[3:])]
+        lines.append(",".join(values))
+    return [{"frames.txt": ("\n".join(lines) + "\n").encode()}]
+
+
+def _log(parts: Parts, folder: Path) -> str:
+    table = read_frame_log(_file(parts, folder))
+    assert len(table.states) == len(table.reasons) == len(table)
+    known = [name for name in table.numbers if table.known(name)]
+    return f"{len(table)} {len(known)}"
 
 
 def _text(parts: Parts) -> str:
@@ -173,6 +189,7 @@ TARGETS = [
     Target("trajectory", "poses in TUM format, evaluated", _trajectory_seeds, _trajectory),
     Target("odometry file", "odometry in TUM format, asked", _trajectory_seeds, _odometry),
     Target("covariances", "covariances of poses", _covariance_seeds, _covariances),
+    Target("frame log", "frames.csv of a run", _log_seeds, _log),
     Target(
         "start pose",
         "`--start-pose`, `map_start_pose`",

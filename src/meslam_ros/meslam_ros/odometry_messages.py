@@ -190,9 +190,9 @@ def from_odometry(message: Odometry, mount: CameraMount) -> OdometryEstimate:
     reason = ""
     if message.child_frame_id.lstrip("/") != mount.base_frame:
         reason = f"the odometry is of {message.child_frame_id!r}, the base is {mount.base_frame!r}"
-    elif not np.isfinite(covariance).all():
+    elif not np.isfinite(covariance).all() or np.diag(covariance).min() < 0.0:
         covariance = np.eye(6) * UNKNOWN_VARIANCE
-        reason = "the odometry's covariance is not finite"
+        reason = "the odometry's covariance is none: not finite, or negative"
     elif covariance[0, 0] >= UNKNOWN_VARIANCE:
         reason = "the odometry says that it is not to be trusted"
     return OdometryEstimate(

@@ -14,6 +14,7 @@ NODES = (
     "slam_node",
     "bag_player_node",
     "camera_node",
+    "viewer_node",
 )
 TOOLS = ("call_service",)
 # colcon runs a symlink of this file in its build folder: the folders beside the real file count.

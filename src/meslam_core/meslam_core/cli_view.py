@@ -41,8 +41,9 @@ def view(
     The map, its regions, the path, the camera and what it saw, at any time of the run. For a
     running system there is `viewer_node`. Ctrl-C ends it.
     """
+    from meslam_core.viewer.finished_run import FinishedRun
     from meslam_core.viewer.scene import ViewControls
-    from meslam_core.viewer.viewer import FinishedRun, Viewer
+    from meslam_core.viewer.viewer import Viewer
 
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

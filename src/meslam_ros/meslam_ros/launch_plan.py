@@ -56,6 +56,11 @@ ARGUMENTS = {
     "odometry_topic": LaunchArgument(
         "", "nav_msgs/Odometry from elsewhere, such as wheels, instead of the odometry node"
     ),
+    "viewer": LaunchArgument("false", "serve a page in the browser that shows the map", FLAG),
+    "viewer_host": LaunchArgument(
+        "127.0.0.1", "address of the page; 0.0.0.0 for the network too, which then sees the map"
+    ),
+    "viewer_port": LaunchArgument("8080", "port of the page; the next free one if it is taken"),
     "rviz": LaunchArgument("false", "start RViz with the system's layout", FLAG),
     "namespace": LaunchArgument("", "of all nodes, for several systems side by side"),
     "params_file": LaunchArgument("", "parameters of all nodes; empty for the defaults"),
@@ -124,6 +129,7 @@ def plan(given: Mapping[str, str], share: Path) -> list[NodePlan]:
         *_system(values, share),
         *_player(values),
         *_camera(values),
+        *_viewer(values),
         *_rviz(values, share),
     ]
 
@@ -210,6 +216,25 @@ def _camera(values: Mapping[str, str]) -> list[NodePlan]:
             )
         ]
     return []
+
+
+def _viewer(values: Mapping[str, str]) -> list[NodePlan]:
+    if not _flag(values, "viewer"):
+        return []
+    return [
+        NodePlan(
+            package="meslam_ros",
+            executable="viewer_node",
+            name="viewer_node",
+            namespace=values["namespace"],
+            parameters={
+                "base_frame": _base_frame(values),
+                "host": values["viewer_host"],
+                "port": int(values["viewer_port"]),
+            },
+            remappings=_camera_remappings(values),
+        )
+    ]
 
 
 def _rviz(values: Mapping[str, str], share: Path) -> list[NodePlan]:

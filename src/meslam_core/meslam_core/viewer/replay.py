@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from meslam_core.camera import PinholeCamera
 from meslam_core.map.reader import LoadedMap
 from meslam_core.regions.observed_mask import OBSERVED
 from meslam_core.report.run_folder import RunFolder
@@ -17,7 +16,7 @@ from meslam_core.trajectory import NANOSECONDS, Trajectory
 from meslam_core.viewer.page import Page
 from meslam_core.viewer.panel import TIMELINE_ORDER, within
 from meslam_core.viewer.run_images import RunImages
-from meslam_core.viewer.scene import CameraView, RegionBox, RegionState, Scene, Status
+from meslam_core.viewer.scene import RegionBox, RegionState, Scene, Status, camera_view
 
 TICK_S = 0.05
 SPEEDS = ("0.5", "1", "2", "5", "10")
@@ -163,11 +162,3 @@ class Replay:
             self._slider.value = round(time_s, 2)  # type: ignore[misc]  # it has a setter
             if time_s == self._duration_s:
                 self._playing.value = False  # type: ignore[misc]
-
-
-def camera_view(T_map_camera: Pose, camera: PinholeCamera | None) -> CameraView:
-    """A camera of known or ordinary intrinsics at a pose."""
-    if camera is None:
-        return CameraView(T_map_camera)
-    fov_rad = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))
-    return CameraView(T_map_camera, fov_rad, camera.width / camera.height)

@@ -6,17 +6,16 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from meslam_core.errors import MeslamError
 from meslam_core.frame import RgbdFrame
 from meslam_core.recordings.recording import Recording
+from meslam_core.viewer.camera_image import reduced
 
 logger = logging.getLogger(__name__)
 
-IMAGE_WIDTH = 320
 # So far ahead reading on is faster than looking for the place.
 NEAR_FRAMES = 20
 
@@ -80,12 +79,3 @@ class RunImages:
             self._next += 1
         self._next += 1
         return next(self._frames)
-
-
-def reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """An image (H, W, 3) no wider than the page needs."""
-    height, width = image.shape[:2]
-    if width <= IMAGE_WIDTH:
-        return image
-    size = (IMAGE_WIDTH, max(1, round(height * IMAGE_WIDTH / width)))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

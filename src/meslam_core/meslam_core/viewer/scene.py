@@ -10,6 +10,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from meslam_core.camera import PinholeCamera
 from meslam_core.regions.grid import RegionIndex
 from meslam_core.se3 import Pose
 
@@ -69,6 +70,14 @@ class CameraView:
     T_map_camera: Pose
     vertical_fov_rad: float = 0.8
     aspect: float = 4.0 / 3.0
+
+
+def camera_view(T_map_camera: Pose, camera: PinholeCamera | None) -> CameraView:
+    """A camera of known or ordinary intrinsics at a pose."""
+    if camera is None:
+        return CameraView(T_map_camera)
+    fov_rad = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))
+    return CameraView(T_map_camera, fov_rad, camera.width / camera.height)
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from faults import material
 from faults.bench import Bench
-from faults.expectations import LOST, Problem, ended, refused, run, seen_of, tracked
-from faults.fault import Fault, Group, Seen
+from faults.expectations import LOST, ended, refused, run, seen_of, tracked
+from faults.fault import Group, Seen, faults_of
 from faults.material import FRAMES
 
 Lines = list[str]
@@ -126,15 +126,18 @@ def _cut(file: Path) -> None:
     file.write_bytes(file.read_bytes()[:2000])
 
 
-def _fault(
-    name: str,
-    injected: str,
-    expected: str,
-    inject: Callable[[Bench], Seen],
-    problem: Problem,
-    quick: bool = False,
-) -> Fault:
-    return Fault(name, Group.INPUT, injected, expected, inject, problem, quick=quick)
+def _several(bench: Bench, arrays: Sequence[object]) -> Seen:
+    done, words = [], ""
+    for points in arrays:
+        seen = _asked(_saved(points))(bench)
+        if seen.facts["report"]:
+            return seen
+        done += seen.facts["ended"]
+        words = seen.words
+    return Seen(f"{len(done)} refused, the last one: {words}", {"ended": tuple(done)})
+
+
+_fault = faults_of(Group.INPUT)
 
 
 ARGUMENTS = (
@@ -287,17 +290,6 @@ POINTS = (
         refused("points.npy"),
     ),
 )
-
-
-def _several(bench: Bench, arrays: Sequence[object]) -> Seen:
-    done, words = [], ""
-    for points in arrays:
-        seen = _asked(_saved(points))(bench)
-        if seen.facts["report"]:
-            return seen
-        done += seen.facts["ended"]
-        words = seen.words
-    return Seen(f"{len(done)} refused, the last one: {words}", {"ended": tuple(done)})
 
 
 FAULTS = ARGUMENTS + ODOMETRY + START + POINTS

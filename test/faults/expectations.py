@@ -7,12 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from data.bag_builder import BagBuilder
 from faults.bench import Bench, Ended
 from faults.fault import Seen
 from faults.material import QUICK, Shot, record, shots, truth
 
 Problem = Callable[[Seen], str]
 LOST, BAD_INPUT, INTERRUPTED = 3, 2, 130
+LONGEST = 300
+"""Characters of a message in the table."""
 
 
 def run(bench: Bench, recording: Path, *options: object, **how: Any) -> Seen:
@@ -50,9 +53,14 @@ def seen_of(bench: Bench, *ended: Ended, **facts: Any) -> Seen:
     for each in ended:
         if each.status != 0 or not report:
             told.append(f"exit status {each.status}")
-        told += each.lines[-2:]
+        told += [_short(line) for line in each.lines[-2:]]
     words = ", ".join(told).replace(f"{bench.folder}/", "").replace(f"{bench.cache}/", "")
     return Seen(words, {"ended": ended, **facts})
+
+
+def _short(line: str) -> str:
+    """A message without its last part, where it is long."""
+    return line if len(line) <= LONGEST else f"{line[:LONGEST]}..."
 
 
 def command(*arguments: object) -> Callable[[Bench], Seen]:
@@ -68,6 +76,18 @@ def walked(change: Callable[[list[Shot]], object], *options: object) -> Callable
         changed = change(taken)
         taken = changed if isinstance(changed, list) else taken
         return run(bench, record(taken, bench.folder), *options)
+
+    return inject
+
+
+def built(build: Callable[[BagBuilder, Shot], None]) -> Callable[[Bench], Seen]:
+    """The walk with other messages than a camera's."""
+
+    def inject(bench: Bench) -> Seen:
+        builder = BagBuilder()
+        for shot in shots():
+            build(builder, shot)
+        return run(bench, builder.write(bench.folder))
 
     return inject
 

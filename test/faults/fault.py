@@ -79,3 +79,19 @@ class Fault:
                 raise ValueError(f"{self.name}: {text!r} does not fit into a table")
         if not 0.0 < self.limit_s <= 300.0:
             raise ValueError(f"{self.name}: a limit of {self.limit_s} s; the whole table has 1200")
+
+
+def faults_of(group: Group) -> Callable[..., Fault]:
+    """A function that makes faults of one group, from all that is the fault's own."""
+
+    def fault(
+        name: str,
+        injected: str,
+        expected: str,
+        inject: Callable[[Bench], Seen],
+        problem: Callable[[Seen], str],
+        **options: Any,
+    ) -> Fault:
+        return Fault(name, group, injected, expected, inject, problem, **options)
+
+    return fault

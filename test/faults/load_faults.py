@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 from faults import material
 from faults.bench import MESLAM, Bench, Ended
-from faults.expectations import Problem, ended, run, seen_of, tracked
-from faults.fault import Fault, Group, Seen
+from faults.earlier_run import started
+from faults.expectations import ended, run, seen_of, tracked
+from faults.fault import Group, Seen, faults_of
 from faults.material import FRAMES
-from faults.storage_faults import started
 
 CYCLE_S = 0.1
 
@@ -131,15 +131,7 @@ def _eight_done(seen: Seen) -> str:
     return "" if seen.facts["report"].get("frames_tracked") == 8 else "not eight frames tracked"
 
 
-def _fault(
-    name: str,
-    injected: str,
-    expected: str,
-    inject: Callable[[Bench], Seen],
-    problem: Problem,
-    alone: bool = False,
-) -> Fault:
-    return Fault(name, Group.LOAD, injected, expected, inject, problem, alone=alone)
+_fault = faults_of(Group.LOAD)
 
 
 FAULTS = (

@@ -34,6 +34,9 @@ from meslam_core.se3 import Pose
 from meslam_core.trajectory import Trajectory, write_tum
 
 FRAMES = 24
+MIDDLE = FRAMES // 2
+WHILE = slice(8, 14)
+"""The frames of a fault that passes by."""
 START_NS = 1_700_000_000_000_000_000
 QUICK = tuple(
     word

@@ -1,0 +1,175 @@
+"""Processes that are killed or interrupted."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from faults import material
+from faults.bench import MESLAM, Bench, wait_for
+from faults.earlier_run import (
+    SLOW,
+    again,
+    over_an_earlier_run,
+    started,
+)
+from faults.expectations import (
+    INTERRUPTED,
+    Problem,
+    run,
+)
+from faults.fault import Group, Seen, faults_of
+from faults.material import QUICK
+
+KILLED_SAVES = 12
+
+KILLED_RUNS = 5
+
+
+def _killed_runs(bench: Bench, out: Path) -> Seen:
+    """Killed at random instants, then once more to the end."""
+    from faults.kept_maps import lost_maps
+
+    generator = random.Random(5)
+    lost, killed = [], 0
+    for _ in range(KILLED_RUNS):
+
+        def kill(process: subprocess.Popen[str]) -> None:
+            started(out, process)
+            time.sleep(generator.uniform(0.0, 3.0))
+            process.send_signal(signal.SIGKILL)
+
+        done = bench.meslam("run", material.bag(bench), "--out", out, *QUICK, during=kill)
+        killed += done.status == -signal.SIGKILL
+        lost += lost_maps(out)
+    seen = again(bench, out)
+    words = f"{killed} of {KILLED_RUNS} runs killed, {len(lost)} maps lost; then {seen.words}"
+    return Seen(words, {**seen.facts, "lost": lost, "killed": killed})
+
+
+def _killed_saves(bench: Bench) -> Seen:
+    """A process that saves two maps in turn is killed; one of them is there, whole."""
+    from faults.kept_maps import lost_maps
+
+    stored = bench.copy(material.stored_map(bench))
+    generator = random.Random(7)
+    lost = []
+    saving = (
+        "import sys, itertools; from pathlib import Path\n"
+        "from meslam_core.map.store import MapStore\n"
+        "from dataclasses import replace\n"
+        "store = MapStore(sys.argv[1]); loaded = store.load(); first = loaded.regions[0]\n"
+        "print('saving', flush=True)\n"
+        "for version in itertools.count(first.version + 1):\n"
+        "    store.save([replace(first, version=version)], loaded.grid)\n"
+    )
+    for _ in range(KILLED_SAVES):
+        process = subprocess.Popen(
+            [MESLAM[0], "-c", saving, str(stored)], stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()
+            time.sleep(generator.uniform(0.0, 0.2))
+        finally:
+            process.kill()
+            process.communicate()
+        lost += lost_maps(bench.folder)
+    return Seen(f"{KILLED_SAVES} saves killed, {len(lost)} maps lost", {"lost": lost})
+
+
+def _none_lost(seen: Seen) -> str:
+    if seen.facts["lost"]:
+        return str(seen.facts["lost"][0])
+    return "" if seen.facts.get("killed", 1) else "no run was killed in time"
+
+
+def _interrupted(number: signal.Signals, times: int = 1) -> Callable[[Bench], Seen]:
+    def inject(bench: Bench) -> Seen:
+        out = bench.folder / "results"
+
+        def interrupt(process: subprocess.Popen[str]) -> None:
+            started(out, process)
+            # The log of the frames grows line by line, and by blocks on the disk.
+            wait_for(lambda: process.poll() is not None or _works(process), "the first frames")
+            for _ in range(times):
+                process.send_signal(number)
+                time.sleep(0.3)
+
+        return run(bench, material.bag(bench), *SLOW, during=interrupt)
+
+    return inject
+
+
+def _works(process: subprocess.Popen[str]) -> bool:
+    """Whether a run has threads that track and map."""
+    with open(f"/proc/{process.pid}/status", encoding="ascii") as status:
+        return any(line.startswith("Threads:") and int(line.split()[1]) > 2 for line in status)
+
+
+def _stopped(status: int) -> Problem:
+    def problem(seen: Seen) -> str:
+        (told,) = seen.facts["ended"]
+        if told.status not in (status, 0):
+            return f"exit status {told.status} instead of {status}: {told.message}"
+        if told.unexplained:
+            return str(told.unexplained)
+        return "" if seen.facts["report"] else "no results of what was done"
+
+    return problem
+
+
+def _twice(seen: Seen) -> str:
+    """The second request ends it at once: a map or none, and nothing half."""
+    (told,) = seen.facts["ended"]
+    expected = (INTERRUPTED, -signal.SIGINT, 1, 0)
+    return "" if told.status in expected else f"exit status {told.status}"
+
+
+_fault = faults_of(Group.STORAGE)
+
+KILLED = (
+    _fault(
+        "killed-while-saving",
+        f"{KILLED_SAVES} SIGKILLs at random instants of a save",
+        "every time the map loads",
+        _killed_saves,
+        _none_lost,
+    ),
+    _fault(
+        "killed-while-running",
+        f"{KILLED_RUNS} SIGKILLs at random instants of runs over an earlier map",
+        "every time a map loads; the next run works",
+        over_an_earlier_run(_killed_runs),
+        _none_lost,
+        limit_s=240.0,
+    ),
+    _fault(
+        "ctrl-c",
+        "CTRL-C in the middle of a run",
+        "status 130; the results so far are there, and the map loads",
+        _interrupted(signal.SIGINT),
+        _stopped(INTERRUPTED),
+    ),
+    _fault(
+        "sigterm",
+        "SIGTERM in the middle of a run",
+        "status 130; the results so far are there, and the map loads",
+        _interrupted(signal.SIGTERM),
+        _stopped(INTERRUPTED),
+    ),
+    _fault(
+        "ctrl-c-twice",
+        "CTRL-C again and again",
+        "it ends at once; no half map is left",
+        _interrupted(signal.SIGINT, 3),
+        _twice,
+    ),
+)
+
+
+FAULTS = KILLED

@@ -3,7 +3,7 @@
     make demo                     a simulated room, made on the first run
     make demo RECORDING=path      a recording of your own
 
-Starts `slam_node` and plays the recording through `bag_player_node` over real DDS, calls the
+Starts `slam_node` and a page in the browser that shows the map, and plays the recording through `bag_player_node` over real DDS, calls the
 services that export and save the map, and writes trajectories, map, mesh, report and pictures.
 """
 
@@ -30,6 +30,7 @@ from demo_report import (
     find_truth,
     summarise,
 )
+from demo_viewer import live_page
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -64,12 +65,17 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "out", help="folder of the results")
     parser.add_argument("--truth", type=Path, help="poses in TUM format to compare with")
     parser.add_argument("--frames", type=int, default=0, help="play only so many image pairs")
+    parser.add_argument(
+        "--port", type=int, default=8080, help="of the live page; a negative one for no page"
+    )
     options = parser.parse_args()
     console = Console()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         recording = options.recording or simulated(console)
-        run(console, recording, options.out, options.truth, options.frames)
+        _own_domain()
+        with live_page(console, options.port):
+            run(console, recording, options.out, options.truth, options.frames)
     except TrackingLostError as error:
         console.print(f"[bold red]demo failed:[/] {error}", highlight=False)
         return 3
@@ -123,7 +129,6 @@ def run(console: Console, path: Path, out: Path, truth_file: Path | None, frames
 
 def map_live(console: Console, path: Path, count: int, staging: Path) -> Live:
     """Start the nodes, play the recording, ask for the map."""
-    _own_domain()
     folders = {"export_folder": staging, "map_folder": staging}
     playing = {
         "recording": path,

@@ -3,8 +3,9 @@
     make demo                     a simulated room, made on the first run
     make demo RECORDING=path      a recording of your own
 
-Starts `slam_node` and a page in the browser that shows the map, and plays the recording through `bag_player_node` over real DDS, calls the
-services that export and save the map, and writes trajectories, map, mesh, report and pictures.
+Starts `slam_node`, serves a page in the browser that shows the map while it grows, and plays the
+recording through `bag_player_node` over real DDS, calls the services that export and save the map,
+and writes trajectories, map, mesh, report and pictures.
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ def trajectory_section(rows: Rows, recordings: Sequence[str]) -> str:
     lines += ["", *table(columns, body), ""]
     if missing := [name for name in SEQUENCES if name not in mine]:
         lines += [
-            f"Of the paper's sequences, {', '.join(missing)} were not at hand here. ",
+            f"Of the paper's sequences, not at hand here: {', '.join(missing)}.",
             DROP_IN,
         ]
     others = [name for name in recordings if tum_name(name) and not sequence_of(name)]

@@ -378,6 +378,11 @@ def test_a_full_disk_behind_standard_output_is_told(folder):
     assert "Traceback" not in done.stderr
 
 
+def test_names_do_not_rule_the_terminal(tmp_path):
+    recording = tmp_path / "\x1b[2Jnight\nfall.mcap"
+    assert_refused(meslam("info", recording), "\\x1b[2Jnight\\nfall.mcap", "does not exist")
+
+
 def test_info_describes_a_map(stored_map):
     facts = json.loads(meslam("info", stored_map, "--json").stdout)
     assert facts["regions"] == 1

@@ -20,7 +20,12 @@ INTERRUPTED = 130
 
 def complain(message: str) -> None:
     """One line on standard error."""
-    typer.echo(f"meslam: {message}", err=True)
+    typer.echo(f"meslam: {printable(message)}", err=True)
+
+
+def printable(text: str) -> str:
+    """A text in one line, without the codes by which names in files could rule a terminal."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def print_entries(entries: Mapping[str, Any], as_json: bool, text: str | None = None) -> None:
@@ -41,7 +46,7 @@ def _readable(value: Any) -> str:
         return ", ".join(f"{key} {_readable(item)}" for key, item in value.items()) or "-"
     if isinstance(value, list | tuple):
         return ", ".join(_readable(item) for item in value) or "-"
-    return "-" if value is None else str(value)
+    return "-" if value is None else printable(str(value))
 
 
 def run_summary(report: Mapping[str, Any], out: Path) -> str:

@@ -20,6 +20,8 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from meslam_core.command_output import printable
+
 if TYPE_CHECKING:
     from meslam_core.slam import FrameResult
 
@@ -39,7 +41,8 @@ class ConsoleHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print one record on today's standard error, which a progress bar may have replaced."""
-        print(f"meslam: {record.levelname.lower()}: {record.getMessage()}", file=sys.stderr)
+        told = printable(record.getMessage())
+        print(f"meslam: {record.levelname.lower()}: {told}", file=sys.stderr)
 
 
 class RunBar:

@@ -29,7 +29,9 @@ from demo_report import (
     Live,
     evaluate,
     find_truth,
+    origin,
     summarise,
+    write_page,
 )
 from demo_viewer import live_page
 from rich.console import Console
@@ -40,6 +42,7 @@ from meslam_core.recordings import open_recording
 from meslam_core.results import MAP, ResultFolder
 from meslam_core.simulation.simulator import simulate
 from meslam_core.simulation.writer import surface_path, truth_path, write_simulation
+from meslam_core.trajectory import read_tum
 from meslam_interfaces.srv import ExportMap, ListRegions, SaveMap
 from meslam_ros import topics
 from meslam_ros.client import MeslamClient
@@ -110,13 +113,15 @@ def run(console: Console, path: Path, out: Path, truth_file: Path | None, frames
     started = time.monotonic()
     recording = open_recording(path)
     count = min(frames or len(recording), len(recording))
-    truth = find_truth(path, truth_file)
+    truth_file = find_truth(path, truth_file)
+    truth = None if truth_file is None else read_tum(truth_file)
     with ResultFolder(out) as results:
         staging = results.incomplete("")
         live = map_live(console, path.resolve(), count, staging)
         with console.status("evaluating"):
             report = evaluate(recording, path, truth, live, staging)
         report["wall_s"] = time.monotonic() - started
+        report |= origin(recording, truth_file, count)
         results.write_report(report)
         for name in (MESH, PATH_PICTURE, ERROR_PICTURE, VIEWS_PICTURE, NODES_LOG, PLAYER_LOG):
             if (staging / name).exists():
@@ -125,6 +130,9 @@ def run(console: Console, path: Path, out: Path, truth_file: Path | None, frames
                 (out / name).unlink(missing_ok=True)
         results.publish()
     recording.close()
+    with _progress(console) as progress:
+        task = progress.add_task("writing the report", total=None)
+        write_page(out, lambda done, total: progress.update(task, completed=done, total=total))
     summarise(console, path, out, report)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,8 @@ import open3d as o3d
 from rich.console import Console
 from rich.table import Table
 
+from meslam_core.cli_report import PAGE
+from meslam_core.config import MeslamConfig
 from meslam_core.evaluation.plots import (
     ViewPair,
     plot_error_over_time,
@@ -22,11 +27,14 @@ from meslam_core.evaluation.reconstruction import observed_surface, surface_erro
 from meslam_core.evaluation.report import truth_entries
 from meslam_core.evaluation.trajectory_error import AbsoluteError, absolute_error
 from meslam_core.evaluation.views import MeshRenderer
+from meslam_core.frame_log import FRAMES, FrameEntry, FrameLog
+from meslam_core.frame_result import TrackingState
 from meslam_core.recordings.recording import Recording
+from meslam_core.report import read_run, write_report
 from meslam_core.results import ONLINE_TRAJECTORY, TRAJECTORY
 from meslam_core.run_report import run_environment
 from meslam_core.simulation.writer import surface_path, truth_path
-from meslam_core.trajectory import Trajectory, read_tum, write_tum
+from meslam_core.trajectory import Trajectory, write_tum
 from meslam_interfaces.msg import TrackingStatus
 from meslam_interfaces.srv import ExportMap, SaveMap
 from meslam_ros.conversions import stamp_ns
@@ -50,12 +58,35 @@ class Live:
     playing_s: float
 
 
-def find_truth(path: Path, given: Path | None) -> Trajectory | None:
-    """True poses: those given, the simulator's, or a TUM folder's."""
+def find_truth(path: Path, given: Path | None) -> Path | None:
+    """File of true poses: those given, the simulator's, or a TUM folder's."""
     for candidate in (given, truth_path(path), path / "groundtruth.txt"):
         if candidate is not None and (candidate == given or candidate.is_file()):
-            return read_tum(candidate)
+            return candidate
     return None
+
+
+def origin(recording: Recording, truth: Path | None, frames: int) -> dict[str, Any]:
+    """What the report says of where the results come from."""
+    return {
+        "recording": recording.name,
+        "recording_path": str(recording.path.absolute()),
+        "frame_range": [0, None if frames == len(recording) else frames, 1],
+        "camera": recording.camera.to_dict(),
+        "truth": None if truth is None else str(truth.absolute()),
+        "command": shlex.join(["python", *sys.argv]),
+        # The nodes were started without parameters of their own.
+        "config": MeslamConfig().to_mapping(),
+    }
+
+
+def write_page(out: Path, progress: Callable[[int, int], None]) -> None:
+    """Make the page about the results in a folder."""
+    run = read_run(out)
+    try:
+        write_report([run], out / PAGE, VIEWS, progress)
+    finally:
+        run.close()
 
 
 def evaluate(
@@ -64,6 +95,7 @@ def evaluate(
     """Write trajectories and pictures; the content of the report."""
     write_tum(staging / TRAJECTORY, live.refined)
     write_tum(staging / ONLINE_TRAJECTORY, live.online)
+    _record(live.statuses, staging / FRAMES)
     mesh = o3d.io.read_triangle_mesh(str(staging / MESH))
     report = _report(live)
     error = None
@@ -79,6 +111,33 @@ def evaluate(
     if error is not None and truth is not None and surface_path(path).exists():
         report["surface"] = _surface(recording, path, truth, error, mesh)
     return report
+
+
+def _record(statuses: list[TrackingStatus], target: Path) -> None:
+    """What the nodes told of every frame."""
+    with FrameLog(target) as log:
+        for status in statuses:
+            log.add(
+                FrameEntry(
+                    stamp_ns=stamp_ns(status.header.stamp),
+                    state=TrackingState(status.state).name,
+                    reason=status.reason,
+                    tracked=status.state in HAS_POSE,
+                    keyframe=status.is_keyframe,
+                    residual_m=status.residual_m,
+                    inlier_ratio=status.inlier_ratio,
+                    loss_distance=status.loss_distance if status.iterations else None,
+                    loss_depth=status.loss_depth if status.iterations else None,
+                    loss_color=status.loss_color if status.iterations else None,
+                    iterations=status.iterations,
+                    tracking_ms=status.tracking_ms,
+                    mapping_ms=status.mapping_ms,
+                    latency_ms=1e3 * status.latency_s,
+                    skipped=status.frames_dropped,
+                    keyframes=status.keyframes,
+                    map_bytes=status.map_bytes,
+                )
+            )
 
 
 def _report(live: Live) -> dict[str, Any]:
@@ -97,6 +156,8 @@ def _report(live: Live) -> dict[str, Any]:
         "frames": len(statuses),
         "frames_tracked": tracked,
         "frames_lost": len(statuses) - tracked,
+        "frames_degraded": sum(status.state == TrackingStatus.DEGRADED for status in statuses),
+        "final_state": TrackingState(last.state).name,
         "frames_dropped": last.frames_dropped,
         "keyframes": last.keyframes,
         "regions": live.saved.regions,
@@ -179,3 +240,4 @@ def summarise(console: Console, path: Path, out: Path, report: dict[str, Any]) -
     console.print(table)
     names = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith("."))
     console.print(f"results in {out}: {', '.join(names)}", highlight=False, soft_wrap=True)
+    console.print(f"look at {out / PAGE}", highlight=False, soft_wrap=True)

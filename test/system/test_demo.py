@@ -84,6 +84,10 @@ def test_people_get_pictures_and_a_summary(desk: tuple[Path, str]) -> None:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     assert "frames with a pose" in output
     assert "ATE RMSE" in output
+    page = (out / "report.html").read_text()
+    for part in ("path", "map", "tracking", "time", "growth"):
+        assert f'<section id="{part}">' in page
+    assert str(out / "report.html") in output
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 

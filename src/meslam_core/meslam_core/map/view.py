@@ -17,6 +17,8 @@ COARSE_STEP_M = 0.03
 FINE_SAMPLES = 24
 BEHIND_M = 0.08
 SLAB = 16
+# So many rays at once stay in the processor's cache.
+BATCH = 2048
 # A ray of which less ends at a surface sees none.
 MIN_OPACITY = 0.5
 # Value of f where no surface was seen near: free space.
@@ -43,14 +45,16 @@ def render_view(
     directions = camera.pixel_directions().reshape(-1, 3)
     turned = directions.astype(np.float64) @ T_map_camera[:3, :3].T
     origin = T_map_camera[:3, 3]
-    hit_m = _first_surface(neural_map, origin, turned, far_m)
     color = np.zeros((len(directions), 3), np.uint8)
     depth_m = np.zeros(len(directions), np.float32)
-    rays = np.flatnonzero(np.isfinite(hit_m))
-    if len(rays):
-        seen, rgb, found_m = _rendered(neural_map, origin, turned[rays], hit_m[rays])
-        color[rays[seen]] = np.clip(255.0 * rgb[seen] + 0.5, 0, 255).astype(np.uint8)
-        depth_m[rays[seen]] = found_m[seen]
+    for start in range(0, len(turned), BATCH):
+        batch = slice(start, start + BATCH)
+        hit_m = _first_surface(neural_map, origin, turned[batch], far_m)
+        rays = np.flatnonzero(np.isfinite(hit_m))
+        if len(rays):
+            seen, rgb, found_m = _rendered(neural_map, origin, turned[start + rays], hit_m[rays])
+            color[start + rays[seen]] = np.clip(255.0 * rgb[seen] + 0.5, 0, 255).astype(np.uint8)
+            depth_m[start + rays[seen]] = found_m[seen]
     size = (camera.height, camera.width)
     return color.reshape(*size, 3), depth_m.reshape(size)
 

@@ -108,7 +108,7 @@ def talk(topic: str) -> None:
     rclpy.try_shutdown()
 
 
-def listen(topic: str) -> dict[str, Any]:
+def listen(topic: str, limit_s: float) -> dict[str, Any]:
     """Wait for images; which arrived of COUNT since the first one did."""
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
@@ -124,7 +124,7 @@ def listen(topic: str) -> dict[str, Any]:
         arrived[int(image.header.frame_id)] = age.nanoseconds / 1e6
 
     node.create_subscription(Image, topic, take, qos_profile_sensor_data)
-    deadline = time.monotonic() + LIMIT_S
+    deadline = time.monotonic() + limit_s
     while time.monotonic() < deadline:
         rclpy.spin_once(node, timeout_sec=0.1)
         if arrived and max(arrived) - min(arrived) >= COUNT - 1:
@@ -141,11 +141,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("role", choices=("talk", "listen"))
     parser.add_argument("topic")
+    parser.add_argument("--limit", type=float, default=LIMIT_S, help="of listening [s]")
     told = parser.parse_args()
     if told.role == "talk":
         talk(told.topic)
     else:
-        print(json.dumps(listen(told.topic)))
+        print(json.dumps(listen(told.topic, told.limit)))
 
 
 if __name__ == "__main__":

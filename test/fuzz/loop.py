@@ -108,7 +108,10 @@ def fuzz(
     while time.process_time() - started < seconds:
         if executions is not None and outcome.executions >= executions:
             break
-        parts = target.mutate(rng.choice(corpus), corpus, rng)
+        try:
+            parts = target.mutate(rng.choice(corpus), corpus, rng)
+        except RecursionError:
+            continue  # nested so deeply that it is never changed with care
         before(parts)
         answer, finding = attempt(target, parts)
         outcome.executions += 1

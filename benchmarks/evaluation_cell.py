@@ -185,7 +185,7 @@ def observed(job: SlamRun, surface: o3d.geometry.TriangleMesh) -> NDArray[np.flo
     farthest_m = MeslamConfig().sensor.max_depth_m
     points = observed_surface(surface, camera, shown, farthest_m=farthest_m)
     partial = kept.with_name(f".{os.getpid()}.npy")
-    np.save(partial, points)
+    np.save(partial, points, allow_pickle=False)
     partial.replace(kept)
     return points
 

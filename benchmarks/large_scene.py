@@ -158,7 +158,7 @@ class Scene:
 def evaluated(job: Job, scene: Scene) -> tuple[dict[str, Any], Path2d]:
     """Figures of a finished run, and what is drawn of it."""
     report = json.loads((job.out / REPORT).read_text())
-    notes = dict(np.load(job.out / FRAMES))
+    notes = dict(np.load(job.out / FRAMES, allow_pickle=False))
     refined = absolute_error(read_tum(job.out / TRAJECTORY), scene.truth)
     online = absolute_error(read_tum(job.out / ONLINE_TRAJECTORY), scene.truth)
     along_m = path_m(refined.truth)

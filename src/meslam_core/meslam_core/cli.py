@@ -31,17 +31,26 @@ from meslam_core.errors import ConfigError, MeslamError
 # Torch and Open3D take seconds to import, so every command imports what it needs itself.
 if TYPE_CHECKING:
     from meslam_core.camera import PinholeCamera
+    from meslam_core.recordings.topics import RecordingTopics
 
 NEXT_STEPS = """\
 MeSLAM maps a room with an RGB-D camera and keeps the map in small neural networks.
 
-  meslam run RECORDING --out DIR         track and map a recording
-  meslam mesh DIR/map.meslam --out room.ply
-  meslam info RECORDING_OR_MAP           what a recording or a map holds
-
-No recording at hand? Make one:
-  meslam simulate room --duration 20 --out room.mcap
+Try it without a camera, in two minutes:
+  meslam simulate room --duration 10 --out room.mcap
   meslam run room.mcap --out out --truth room.truth.txt
+
+A recording of yours (a bag of RealSense or ROS, TUM, folders of images):
+  meslam info RECORDING                  what is in it, and whether it can be used
+  meslam run RECORDING --out out         track and map it
+
+What came of it:
+  meslam view out                        the map in the browser
+  meslam report out                      one page of errors, speed and pictures
+  meslam mesh out/map.meslam --out room.ply
+
+  meslam doctor                          something does not work? What, and how to mend it
+  meslam --install-completion            TAB completes commands and options
 
 `meslam --help` lists all commands, `meslam COMMAND --help` explains one.
 """
@@ -68,10 +77,21 @@ app = typer.Typer(
     cls=_Commands,
     help="Dense RGB-D SLAM whose map is a set of small neural networks.",
     pretty_exceptions_enable=False,
-    add_completion=False,
     rich_markup_mode=None,
     invoke_without_command=True,
 )
+
+
+def _presets() -> list[str]:
+    from meslam_core.config import PRESETS
+
+    return list(PRESETS)
+
+
+def _scenes() -> list[str]:
+    from meslam_core.simulation.scenes import SCENES
+
+    return list(SCENES)
 
 
 def main() -> None:
@@ -96,6 +116,15 @@ CameraOption = Annotated[
     Path | None,
     typer.Option(help="camera.json with width, height, fx, fy, cx, cy instead of the recording's."),
 ]
+TopicOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic",
+        metavar="ROLE=TOPIC",
+        help="Topic of a bag that is color, depth, color_info or depth_info, where its content "
+        "does not tell; repeatable.",
+    ),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; repeatable."),
@@ -115,8 +144,13 @@ def run(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING")],
     out: Annotated[Path, typer.Option(help="Folder for the results; made if missing.")],
     camera: CameraOption = None,
+    topics: TopicOption = None,
     preset: Annotated[
-        str, typer.Option(help="Settings to start from: default, fine, paper or imap_star.")
+        str,
+        typer.Option(
+            help="Settings to start from: default, fine, paper or imap_star.",
+            autocompletion=_presets,
+        ),
     ] = "default",
     overrides: SetOption = None,
     frames: Annotated[
@@ -186,7 +220,7 @@ def run(
         seed=seed,
         command=shlex.join(["meslam", *sys.argv[1:]]),
     )
-    source = open_recording(recording, intrinsics)
+    source = open_recording(recording, intrinsics, _topics(topics))
     try:
         with RunBar(error_console()) as bar:
             outcome = pipeline.run(source, config, out, options, bar)
@@ -229,6 +263,7 @@ app.add_typer(cli_doctor.app)
 def info(
     paths: Annotated[list[Path], typer.Argument(metavar="RECORDING_OR_MAP...")],
     camera: CameraOption = None,
+    topics: TopicOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Tell what a recording or a map holds; several maps in one frame are taken as one."""
@@ -239,7 +274,7 @@ def info(
         return
     from meslam_core.recordings import describe, open_recording
 
-    recording = open_recording(path, _camera(camera))
+    recording = open_recording(path, _camera(camera), _topics(topics))
     try:
         print_entries(describe(recording), as_json)
     finally:
@@ -251,13 +286,14 @@ def convert(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A recording of any kind.")],
     target: Annotated[Path, typer.Argument(metavar="TARGET.mcap")],
     camera: CameraOption = None,
+    topics: TopicOption = None,
 ) -> None:
     """Convert a recording to an .mcap file with depth registered to colour."""
     from meslam_core.console import counting_bar, error_console
     from meslam_core.recordings import convert as write_frames
     from meslam_core.recordings import open_recording
 
-    recording = open_recording(source, _camera(camera))
+    recording = open_recording(source, _camera(camera), _topics(topics))
     try:
         with counting_bar(error_console(), "frames") as progress:
             count = write_frames(recording, target, progress)
@@ -268,7 +304,14 @@ def convert(
 
 @app.command()
 def simulate(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="The space to walk through.")],
+    scene: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENE",
+            help="The space to walk through: building, corridor, library or room.",
+            autocompletion=_scenes,
+        ),
+    ],
     out: Annotated[Path, typer.Option(metavar="FILE.mcap", help="The recording.")],
     duration: Annotated[
         float | None, typer.Option(help="Length of the recording [s]; by default one round.")
@@ -308,6 +351,12 @@ def _camera(path: Path | None) -> PinholeCamera | None:
     from meslam_core.camera import PinholeCamera
 
     return None if path is None else PinholeCamera.from_json(path)
+
+
+def _topics(texts: list[str] | None) -> RecordingTopics:
+    from meslam_core.recordings.topics import RecordingTopics
+
+    return RecordingTopics.from_texts(texts or [])
 
 
 def _show_warnings() -> None:

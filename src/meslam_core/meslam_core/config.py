@@ -109,7 +109,10 @@ class MeslamConfig:
             try:
                 values.setdefault(section, {})[name] = _parsed(value)
             except (yaml.YAMLError, ValueError, RecursionError) as error:
-                raise ConfigError(f"the value of {text!r} is neither number nor text") from error
+                raise ConfigError(
+                    f"the value of {text!r} is neither number nor text; "
+                    "write section.name=value, such as field.width=64"
+                ) from error
         return cls.from_mapping(values)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:

@@ -59,9 +59,12 @@ class Continuation:
         store = MapStore(path)
         loaded = store.load()
         if loaded.warnings:
-            raise MapError(f"{path} cannot be continued: {loaded.warnings[0]}")
+            raise MapError(
+                f"{path} cannot be continued: {loaded.warnings[0]}; "
+                "restore a copy, or start a new map"
+            )
         if not loaded.regions:
-            raise MapError(f"{path} holds no region to continue")
+            raise MapError(f"{path} holds no region to continue; start a new map, without --map")
         regions = []
         for entry in store.manifest().regions:
             data = loaded.encoded[entry.index]
@@ -80,7 +83,10 @@ class Continuation:
         shape = first.mask.flags.shape
         for region, _ in self.regions:
             if region.architecture != first.architecture or region.mask.flags.shape != shape:
-                raise MapError("the map's regions have different networks or masks")
+                raise MapError(
+                    "the map's regions have different networks or masks; "
+                    "continue one of the maps it was merged of"
+                )
         own = first.architecture
         field = replace(
             config.field,
@@ -163,7 +169,10 @@ def read_start_pose(text: str) -> Pose:
     try:
         numbers = np.array([float(value) for value in values])
     except ValueError as error:
-        raise ConfigError(f"--start-pose {text!r} holds something that is no number") from error
+        raise ConfigError(
+            f"--start-pose {text!r} holds something that is no number; "
+            "give seven: x y z qx qy qz qw"
+        ) from error
     norm = float(np.linalg.norm(numbers[3:]))
     if not np.isfinite(numbers).all() or not 0.9 < norm < 1.1:
         raise ConfigError(f"--start-pose {text!r} needs a finite position and a unit quaternion")

@@ -109,7 +109,10 @@ class ResultFolder:
         try:
             self.incomplete(REPORT).write_text(text, encoding="utf-8")
         except OSError as error:
-            raise OutputError(f"{self.path / REPORT} cannot be written ({error})") from error
+            raise OutputError(
+                f"{self.path / REPORT} cannot be written ({error}); "
+                "free space, or choose another folder"
+            ) from error
 
     def publish(self) -> None:
         """Replace the results of an earlier run by the new ones.
@@ -124,7 +127,10 @@ class ResultFolder:
                 if result.exists():
                     result.replace(self.path / name)
         except OSError as error:
-            raise OutputError(f"results cannot be written to {self.path} ({error})") from error
+            raise OutputError(
+                f"results cannot be written to {self.path} ({error}); "
+                "free space, or choose another folder"
+            ) from error
 
     def _publish_map(self) -> None:
         """Replace an earlier map without an instant at which there is none."""

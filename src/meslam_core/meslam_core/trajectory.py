@@ -58,7 +58,7 @@ class Trajectory:
         if not rigid.all():
             index = int(np.argmin(rigid))
             at = stamp_text(self.stamps_ns[index])
-            raise EvaluationError(f"pose {index} at {at} s is not a finite rigid motion")
+            raise EvaluationError(f"pose {index} at {at} s is not a finite rigid motion; remove it")
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -192,7 +192,9 @@ def _parse(path: Path, number: int, content: list[str]) -> tuple[int, list[float
     except ValueError as error:
         raise EvaluationError(f"{where}: not a number; expected `{TUM_COLUMNS}`") from error
     if not np.isfinite(row).all() or np.abs(row[:3]).max() > MAX_METERS:
-        raise EvaluationError(f"{where}: a value is not finite, or a position beyond all places")
+        raise EvaluationError(
+            f"{where}: a value is not finite, or a position beyond all places; remove the line"
+        )
     norm = float(np.linalg.norm(row[3:]))
     if not 0.9 < norm < 1.1:
         raise EvaluationError(

@@ -188,7 +188,7 @@ def sample(mesh: o3d.geometry.TriangleMesh, count: int) -> NDArray[np.float32]:
         EvaluationError: when the mesh has no triangles.
     """
     if not mesh.has_triangles():
-        raise EvaluationError("the reconstruction has no triangles")
+        raise EvaluationError("the reconstruction has no triangles; was anything mapped?")
     rng = np.random.default_rng(0)
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
     edges = corners[:, 1:] - corners[:, :1]

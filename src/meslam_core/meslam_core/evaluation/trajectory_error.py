@@ -173,7 +173,8 @@ def _relative_error(
     """Errors of the motions first -> second."""
     if not len(first):
         raise EvaluationError(
-            f"{len(estimate)} paired poses over {estimate.duration_s:.2f} s hold no step of {step}"
+            f"{len(estimate)} paired poses over {estimate.duration_s:.2f} s hold no step of "
+            f"{step}; compare longer trajectories"
         )
     motion = _inverse(estimate.poses[first]) @ estimate.poses[second]
     true_motion = _inverse(truth.poses[first]) @ truth.poses[second]

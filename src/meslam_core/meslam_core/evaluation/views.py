@@ -26,7 +26,9 @@ class MeshRenderer:
 
     def __init__(self, mesh: o3d.geometry.TriangleMesh) -> None:
         if not mesh.has_triangles():
-            raise EvaluationError("the mesh has no triangles, so there is nothing to look at")
+            raise EvaluationError(
+                "the mesh has no triangles, so there is nothing to look at; was anything mapped?"
+            )
         self._caster = o3d.t.geometry.RaycastingScene()
         self._caster.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
         self._triangles = np.asarray(mesh.triangles)

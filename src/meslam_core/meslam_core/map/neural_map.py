@@ -72,7 +72,7 @@ class NeuralMap:
             for region in regions
         ]
         if not self.regions:
-            raise MapError("the map holds no region; nothing has been mapped yet")
+            raise MapError("the map holds no region; nothing has been mapped yet; run more frames")
         architecture = self.regions[0].stored.architecture
         scales = (architecture.truncation_m, architecture.density_scale)
         for region in self.regions:

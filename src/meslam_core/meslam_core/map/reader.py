@@ -57,7 +57,7 @@ def read_map(path: Path, recover: bool = False) -> LoadedMap:
         if not vanished or read_manifest(path) == data:
             break
     if not loaded.regions and loaded.warnings:
-        raise MapError(f"{path}: no region can be read: {loaded.warnings[0]}")
+        raise MapError(f"{path}: no region can be read: {loaded.warnings[0]}; restore a copy")
     return loaded
 
 
@@ -71,13 +71,18 @@ def read_manifest(path: Path) -> bytes:
         return read_file(path / MANIFEST, MAX_MANIFEST_BYTES)
     except (FileNotFoundError, NotADirectoryError):
         if not path.is_dir():
-            raise MapError(f"{path} does not exist or is no folder of a map") from None
+            raise MapError(
+                f"{path} does not exist or is no folder of a map; "
+                "`meslam run RECORDING --out DIR` makes DIR/map.meslam"
+            ) from None
         raise MapError(
             f"{path} holds no {MANIFEST}: it is no map, or its first save was interrupted; what "
             "was written can be loaded with recovery"
         ) from None
     except OSError as error:
-        raise MapError(f"{path / MANIFEST} cannot be read: {error.strerror}") from error
+        raise MapError(
+            f"{path / MANIFEST} cannot be read: {error.strerror}; are its permissions right?"
+        ) from error
 
 
 def _manifest_or_nothing(path: Path) -> bytes:
@@ -137,7 +142,9 @@ def _rebuilt(path: Path, reason: str) -> LoadedMap:
             newest[region.index] = region
             encoded[region.index] = data
     if not newest:
-        raise MapError(f"{reason}; there is no intact region file to rebuild the map from")
+        raise MapError(
+            f"{reason}; there is no intact region file to rebuild the map from; restore a copy"
+        )
     regions = [newest[index] for index in sorted(newest)]
     return LoadedMap(uuid.uuid4().hex, grid_of(regions), regions, encoded, warnings=warnings)
 

@@ -28,7 +28,7 @@ def describe(recording: Recording) -> dict[str, Any]:
     """
     first = next(iter(recording.frames(0, 1)), None)
     if first is None:
-        raise RecordingError(f"{recording.path} has no frames")
+        raise RecordingError(f"{recording.path} has no frames; record it again")
     stamps_ns = recording.stamps_ns
     duration_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     return {

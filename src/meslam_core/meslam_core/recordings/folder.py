@@ -45,7 +45,9 @@ def open_folder(path: Path, camera: PinholeCamera | None = None) -> ImageFileRec
     described = CameraFile.read(file) if camera is None or file.exists() else None
     color, depth = _images(path / "color"), _images(path / "depth")
     if not color and not depth:
-        raise RecordingError(f"{path} has no images in color/ and depth/")
+        raise RecordingError(
+            f"{path} has no images in color/ and depth/; put pairs of the same order there"
+        )
     if len(color) != len(depth):
         raise RecordingError(
             f"{path} has {len(color)} images in color/ and {len(depth)} in depth/; "
@@ -90,5 +92,7 @@ def _stamps(path: Path, count: int, fps: float | None) -> NDArray[np.int64]:
     except (OSError, ValueError) as error:
         raise RecordingError(f"{file} is not one number of seconds a line: {error}") from error
     if len(stamps) != count:
-        raise RecordingError(f"{file} has {len(stamps)} stamps for {count} pairs of images")
+        raise RecordingError(
+            f"{file} has {len(stamps)} stamps for {count} pairs of images; write one line a pair"
+        )
     return np.array(stamps, np.int64)

@@ -174,5 +174,7 @@ class LibrealsenseRecording:
     def _metadata_stamp(self, raw: bytes) -> int:
         match = _TIMESTAMP.search(raw)
         if match is None:
-            raise RecordingError(f"{self.path}: an image has no timestamp in its metadata")
+            raise RecordingError(
+                f"{self.path}: an image has no timestamp in its metadata; record it again"
+            )
         return round(float(match[1]) * 1e6)

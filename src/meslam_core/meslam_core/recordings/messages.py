@@ -84,7 +84,10 @@ class _Serialization:
             else:
                 seconds, nanoseconds = _CDR_STAMP[raw[1] & 1].unpack_from(raw)
         except (struct.error, IndexError) as error:
-            raise RecordingError(f"{self._name} holds a message without a header") from error
+            raise RecordingError(
+                f"{self._name} holds a message without a header; "
+                "record topics of images with stamps"
+            ) from error
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
     def deserialize(self, raw: bytes, topic: str) -> Any:
@@ -132,7 +135,9 @@ class BagSource(_Serialization):
                 return
             # rosbags lets the errors of sqlite, zstd, lz4 and struct through.
             except Exception as error:
-                raise RecordingError(f"{self._path} is damaged: {error}") from error
+                raise RecordingError(
+                    f"{self._path} is damaged: {error}; record it again, or restore a copy"
+                ) from error
             yield connection.topic, time_ns, bytes(raw)
 
     def close(self) -> None:

@@ -108,7 +108,10 @@ class Playback:
             color_camera, color_lens = _camera(color)
             depth_camera, depth_lens = _camera(depth)
         except (RuntimeError, FrameError) as error:
-            raise RecordingError(f"{self._path} has no calibration: {error}") from error
+            raise RecordingError(
+                f"{self._path} has no calibration: {error}; "
+                "record it again with the RealSense tools"
+            ) from error
         return Calibration(
             color_camera, color_lens, depth_camera, depth_lens, pose_of_extrinsics(extrinsics)
         )
@@ -168,7 +171,10 @@ class Playback:
                 sensor.start(receive)
             self._device.as_playback().resume()
         except RuntimeError as error:
-            raise RecordingError(f"librealsense cannot play {self._path}: {error}") from error
+            raise RecordingError(
+                f"librealsense cannot play {self._path}: {error}; "
+                "record it again, or restore a copy"
+            ) from error
 
     def _drain(self, events: queue.Queue[StreamImage | Exception]) -> Iterator[StreamImage]:
         playback = self._device.as_playback()
@@ -188,7 +194,9 @@ class Playback:
                     ) from None
                 continue
             if isinstance(event, Exception):
-                raise RecordingError(f"{self._path} is damaged: {event}") from event
+                raise RecordingError(
+                    f"{self._path} is damaged: {event}; record it again, or restore a copy"
+                ) from event
             yield event
             silent_since = time.monotonic()
 

@@ -265,7 +265,7 @@ class RosBagRecording:
     def _first(self, topic: str) -> Any:
         for _, _, raw in self._source.messages([topic]):
             return self._source.deserialize(raw, topic)
-        raise RecordingError(f"{self.name} has no messages on {topic}")
+        raise RecordingError(f"{self.name} has no messages on {topic}; record that topic too")
 
     def _calibration(self, info_topic: str | None) -> tuple[PinholeCamera, Lens]:
         if info_topic is None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 
-from meslam_core.errors import RecordingError
+from meslam_core.errors import ConfigError, RecordingError
 from meslam_core.recordings.images import COLOR_ENCODINGS, DEPTH_ENCODINGS
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
@@ -28,6 +28,22 @@ class RecordingTopics:
     depth: str | None = None
     color_info: str | None = None
     depth_info: str | None = None
+
+    @classmethod
+    def from_texts(cls, texts: Sequence[str]) -> RecordingTopics:
+        """Read `role=topic` texts, the later ones winning.
+
+        Raises:
+            ConfigError: when one is not of that form, or there is no such role.
+        """
+        roles = [field.name for field in fields(cls)]
+        named = dict(text.partition("=")[::2] for text in texts)
+        if wrong := [role for role, topic in named.items() if role not in roles or not topic]:
+            raise ConfigError(
+                f"{wrong[0]!r} names no topic; write ROLE=TOPIC with one of {', '.join(roles)}, "
+                "such as color=/camera/color/image_raw"
+            )
+        return cls(**named)
 
 
 @dataclass(frozen=True)
@@ -122,16 +138,21 @@ def _best(
     if not candidates:
         raise RecordingError(
             f"{name} has no {kind} images; {_listing(images)}. "
-            f"Name the {kind} topic if it is one of them"
+            f"If it is one of them, name it: --topic {_role(kind)}=TOPIC"
         )
     ranked = sorted(candidates, key=score, reverse=True)
     best = [topic for topic in ranked if score(topic) == score(ranked[0])]
     if len(best) > 1:
         raise RecordingError(
             f"{name} has several {kind} topics: {', '.join(topic.name for topic in best)}; "
-            "name the one to use"
+            f"name the one to use: --topic {_role(kind)}={best[0].name}"
         )
     return best[0].name
+
+
+def _role(kind: str) -> str:
+    """The name of what a person calls colour or depth."""
+    return "color" if kind == "colour" else kind
 
 
 def _color_score(topic: ImageTopic) -> tuple[bool, ...]:

@@ -83,7 +83,9 @@ class McapWriter:
         """
         self._target = Path(target)
         if self._target.suffix != ".mcap" or self._target.is_dir():
-            raise OutputError(f"{target} is not a file name that ends in .mcap")
+            raise OutputError(
+                f"{target} is not a file name that ends in .mcap; choose one that does"
+            )
         self._depth_encoding = depth_encoding
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._partial = self._target.with_name(f".{self._target.name}.{os.getpid()}.partial")

@@ -42,7 +42,7 @@ def write_simulation(
     """
     target = Path(target)
     if target.suffix != ".mcap" or target.is_dir():
-        raise OutputError(f"{target} is not a file name that ends in .mcap")
+        raise OutputError(f"{target} is not a file name that ends in .mcap; choose one that does")
     partial = target.with_name(f".{target.stem}.{os.getpid()}.mcap")
     pairs = [
         (truth_path(partial), truth_path(target)),

@@ -13,12 +13,21 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from meslam_core import __version__, cli_doctor, cli_map, cli_report, cli_view
+from meslam_core import __version__, cli_doctor, cli_map, cli_recording, cli_report, cli_view
+from meslam_core.cli_options import (
+    CameraOption,
+    JsonOption,
+    LeverArmOption,
+    SetOption,
+    TopicOption,
+    camera_of,
+    topics_of,
+)
 from meslam_core.command_output import (
     BAD_INPUT,
     complain,
@@ -29,9 +38,6 @@ from meslam_core.command_output import (
 from meslam_core.errors import ConfigError, MeslamError
 
 # Torch and Open3D take seconds to import, so every command imports what it needs itself.
-if TYPE_CHECKING:
-    from meslam_core.camera import PinholeCamera
-    from meslam_core.recordings.topics import RecordingTopics
 
 NEXT_STEPS = """\
 MeSLAM maps a room with an RGB-D camera and keeps the map in small neural networks.
@@ -88,12 +94,6 @@ def _presets() -> list[str]:
     return list(PRESETS)
 
 
-def _scenes() -> list[str]:
-    from meslam_core.simulation.scenes import SCENES
-
-    return list(SCENES)
-
-
 def main() -> None:
     """Entry point of the `meslam` command."""
     app()
@@ -110,33 +110,6 @@ def _start(
         typer.echo(NEXT_STEPS, nl=False)
     else:
         _show_warnings()
-
-
-CameraOption = Annotated[
-    Path | None,
-    typer.Option(help="camera.json with width, height, fx, fy, cx, cy instead of the recording's."),
-]
-TopicOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--topic",
-        metavar="ROLE=TOPIC",
-        help="Topic of a bag that is color, depth, color_info or depth_info, where its content "
-        "does not tell; repeatable.",
-    ),
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; repeatable."),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
-LeverArmOption = Annotated[
-    bool,
-    typer.Option(
-        "--lever-arm",
-        help="The true poses are another sensor's on the same mount: find its place as well.",
-    ),
-]
 
 
 @app.command()
@@ -201,7 +174,7 @@ def run(
 
     config = MeslamConfig.from_overrides(overrides or [], preset)
     chosen = _frame_range(frames)
-    intrinsics = _camera(camera)
+    intrinsics = camera_of(camera)
     from meslam_core.threads import limit_threads
 
     limit_threads(config.runtime.threads)
@@ -220,7 +193,7 @@ def run(
         seed=seed,
         command=shlex.join(["meslam", *sys.argv[1:]]),
     )
-    source = open_recording(recording, intrinsics, _topics(topics))
+    source = open_recording(recording, intrinsics, topics_of(topics))
     try:
         with RunBar(error_console()) as bar:
             outcome = pipeline.run(source, config, out, options, bar)
@@ -254,86 +227,10 @@ def evaluate(
 
 
 app.add_typer(cli_map.app)
+app.add_typer(cli_recording.app)
 app.add_typer(cli_report.app)
 app.add_typer(cli_view.app)
 app.add_typer(cli_doctor.app)
-
-
-@app.command()
-def info(
-    paths: Annotated[list[Path], typer.Argument(metavar="RECORDING_OR_MAP...")],
-    camera: CameraOption = None,
-    topics: TopicOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Tell what a recording or a map holds; several maps in one frame are taken as one."""
-    path = paths[0]
-    stored = path.is_dir() and ((path / "manifest.json").exists() or path.suffix == ".meslam")
-    if stored or len(paths) > 1:
-        cli_map.describe(paths, as_json)
-        return
-    from meslam_core.recordings import describe, open_recording
-
-    recording = open_recording(path, _camera(camera), _topics(topics))
-    try:
-        print_entries(describe(recording), as_json)
-    finally:
-        recording.close()
-
-
-@app.command()
-def convert(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A recording of any kind.")],
-    target: Annotated[Path, typer.Argument(metavar="TARGET.mcap")],
-    camera: CameraOption = None,
-    topics: TopicOption = None,
-) -> None:
-    """Convert a recording to an .mcap file with depth registered to colour."""
-    from meslam_core.console import counting_bar, error_console
-    from meslam_core.recordings import convert as write_frames
-    from meslam_core.recordings import open_recording
-
-    recording = open_recording(source, _camera(camera), _topics(topics))
-    try:
-        with counting_bar(error_console(), "frames") as progress:
-            count = write_frames(recording, target, progress)
-    finally:
-        recording.close()
-    typer.echo(f"{target}: {count} frames")
-
-
-@app.command()
-def simulate(
-    scene: Annotated[
-        str,
-        typer.Argument(
-            metavar="SCENE",
-            help="The space to walk through: building, corridor, library or room.",
-            autocompletion=_scenes,
-        ),
-    ],
-    out: Annotated[Path, typer.Option(metavar="FILE.mcap", help="The recording.")],
-    duration: Annotated[
-        float | None, typer.Option(help="Length of the recording [s]; by default one round.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of path and noise.")] = 0,
-    fps: Annotated[float, typer.Option(help="Frames a second.")] = 15.0,
-    motion_blur: Annotated[
-        float, typer.Option(help="Exposure time during which the image smears [s].")
-    ] = 0.0,
-) -> None:
-    """Record a simulated hand-held camera, with the true poses and surface beside it.
-
-    FILE.truth.txt holds the poses in TUM format, FILE.surface.ply the surface.
-    """
-    from meslam_core.console import counting_bar, error_console
-    from meslam_core.simulation.simulator import simulate as simulated
-    from meslam_core.simulation.writer import truth_path, write_simulation
-
-    simulation = simulated(scene, duration, seed, fps=fps, motion_blur_s=motion_blur)
-    with counting_bar(error_console(), "frames") as progress:
-        write_simulation(simulation, out, progress)
-    typer.echo(f"{out}: {len(simulation)} frames; true poses in {truth_path(out)}")
 
 
 def _frame_range(text: str) -> slice:
@@ -345,18 +242,6 @@ def _frame_range(text: str) -> slice:
     if step == 0 or (stop is not None and stop <= (start or 0)):
         raise ConfigError(f"--frames {text!r} chooses nothing; A must be below B and STEP positive")
     return slice(start, stop, step)
-
-
-def _camera(path: Path | None) -> PinholeCamera | None:
-    from meslam_core.camera import PinholeCamera
-
-    return None if path is None else PinholeCamera.from_json(path)
-
-
-def _topics(texts: list[str] | None) -> RecordingTopics:
-    from meslam_core.recordings.topics import RecordingTopics
-
-    return RecordingTopics.from_texts(texts or [])
 
 
 def _show_warnings() -> None:

@@ -32,3 +32,8 @@ def every_fault(names: Iterable[str] | None = None) -> list[Fault]:
             faults[fault.name] = fault
             injected[fault.injected] = fault.name
     return list(faults.values())
+
+
+def home_of(fault: Fault) -> str:
+    """Name of the module that lists a fault."""
+    return next(name for name in modules() if fault in importlib.import_module(name).FAULTS)

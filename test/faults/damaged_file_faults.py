@@ -160,14 +160,14 @@ MUTATED = (
         f"{MUTATIONS} mcap files have wrong bits anywhere, or among their first bytes",
         NAMED,
         mutated(_bag("mcap"), _itself, flipped, flipped_early),
-        named(20),
+        named(1),
     ),
     _fault(
         "mcap-pages-lost",
         f"{MUTATIONS} mcap files have a page of zeros, or two pages exchanged",
         NAMED,
         mutated(_bag("mcap"), _itself, zeroed, shuffled),
-        named(20),
+        named(1),
     ),
     _fault(
         "db3-truncated",

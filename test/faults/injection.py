@@ -11,6 +11,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from faults.bench import Bench
+from faults.catalogue import every_fault
 from faults.fault import Fault, SkippedError
 
 RESULT = "result.json"
@@ -67,9 +68,7 @@ def inject(fault: Fault, bench: Bench) -> Result:
 
 
 def main(name: str, folder: Path, cache: Path, module: str) -> None:
-    from faults.catalogue import every_fault
-
-    fault = next(fault for fault in every_fault([module] if module else None) if fault.name == name)
+    fault = next(fault for fault in every_fault([module]) if fault.name == name)
     (folder / BEGUN).touch()
     inject(fault, Bench(folder / "bench", cache)).write(folder / RESULT)
 

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+from faults.catalogue import home_of
 from faults.fault import Fault
 from faults.injection import BEGUN, RESULT, Result, Verdict
 from faults.kept_maps import lost_maps
@@ -26,10 +27,10 @@ class Trial:
     """A fault that is running in a process of its own.
 
     Args:
-        fault: by name in the catalogue, or one that a test made and `module` holds.
+        fault: what.
         folder: for what it makes; emptied first.
         cache: what faults share.
-        module: where the process finds the fault.
+        module: that lists the fault; by default it is looked for in the catalogue.
     """
 
     def __init__(self, fault: Fault, folder: Path, cache: Path, module: str = "") -> None:
@@ -37,9 +38,10 @@ class Trial:
         self._folder = folder
         shutil.rmtree(folder, ignore_errors=True)
         (folder / "bench").mkdir(parents=True)
+        home = module or home_of(fault)
         with (folder / "output.txt").open("wb") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "faults.injection", fault.name, folder, cache, module],
+                [sys.executable, "-m", "faults.injection", fault.name, folder, cache, home],
                 cwd=folder,
                 env={**os.environ, "PYTHONPATH": _python_path(), "OMP_NUM_THREADS": "1"},
                 stdin=subprocess.DEVNULL,

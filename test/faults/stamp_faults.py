@@ -161,7 +161,6 @@ STAMPS = (
         "they are sorted with a warning; every frame is tracked",
         walked(_shuffled),
         tracked(FRAMES, "out of order"),
-        quick=True,
     ),
 )
 

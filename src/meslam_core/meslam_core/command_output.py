@@ -75,7 +75,7 @@ def exit_after_run(outcome: RunOutcome, out: Path) -> None:
         status = INTERRUPTED
     if outcome.not_evaluated:
         complain(f"no comparison with the truth: {outcome.not_evaluated}")
-        status = BAD_INPUT
+        status = status or BAD_INPUT
     if outcome.lost:
         complain(
             f"tracking was lost and never recovered; {tracked} of {frames} frames were tracked, "

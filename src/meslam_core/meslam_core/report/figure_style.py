@@ -40,6 +40,7 @@ _STYLE: Any = {
     "savefig.facecolor": "none",
     "svg.fonttype": "none",
     "svg.hashsalt": "meslam",
+    "text.parse_math": False,
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.labelsize": 9.0,

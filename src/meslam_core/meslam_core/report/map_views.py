@@ -71,7 +71,7 @@ def chosen_stamps(runs: Sequence[RunFolder], count: int) -> list[NDArray[np.int6
             first, last = int(path.stamps_ns[0]), int(path.stamps_ns[-1])
         wanted = first + ((np.arange(count) + 0.5) / count * (last - first)).astype(np.int64)
         nearest = [int(np.abs(path.stamps_ns - stamp).argmin()) for stamp in wanted]
-        result.append(path.stamps_ns[np.unique(nearest)])
+        result.append(path.stamps_ns[np.unique(np.array(nearest, np.intp))])
     return result
 
 

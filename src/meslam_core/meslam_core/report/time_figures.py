@@ -181,7 +181,7 @@ def _draw_states(axes: Axes, runs: Numbered) -> None:
     for row, (_, run) in enumerate(runs):
         table = _frames(run)
         seconds = run_seconds(run, table.stamps_ns)
-        end = max(float(seconds[-1]), 1e-3)
+        end = max(float(seconds.max()), 1e-3)
         ranks = np.array([severity[state] for state in table.states])
         column = np.minimum((seconds / end * STRIP_COLUMNS).astype(int), STRIP_COLUMNS - 1)
         gravest = np.full(STRIP_COLUMNS, -1)

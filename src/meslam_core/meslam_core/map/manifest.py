@@ -103,7 +103,7 @@ class Manifest:
                     f"{MAP_VERSION}; use a newer MeSLAM"
                 )
             return cls._parsed(document)
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise MapError(f"{name}: the manifest is malformed ({error!r})") from error
 
     @classmethod
@@ -116,6 +116,8 @@ class Manifest:
             raise ValueError("the lattice's numbers are not finite")
         if side_m <= 0.0 or not 0.0 <= overlap < 1.0 or len(entries) > MAX_REGIONS:
             raise ValueError("the lattice or the number of regions is out of range")
+        if len({entry.index for entry in entries}) < len(entries):
+            raise ValueError("a place on the lattice has two regions")
         return cls(
             map_id=str(document["map_id"]),
             grid=RegionGrid(origin, side_m, overlap),

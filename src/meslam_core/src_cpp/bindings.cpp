@@ -63,20 +63,12 @@ py::object backward(FusedField& field, const py::array& points, const py::array&
     return result;
 }
 
-template <void (FusedField::*kGet)(float*)>
+template <auto kGet>
 Array get_flat(FusedField& field) {
     Array array = new_parameters(field);
     float* const to = array.mutable_data();
     const py::gil_scoped_release unlocked;
     (field.*kGet)(to);
-    return array;
-}
-
-Array parameters(FusedField& field) {
-    Array array = new_parameters(field);
-    float* const to = array.mutable_data();
-    const py::gil_scoped_release unlocked;
-    field.get_parameters(to);
     return array;
 }
 
@@ -109,9 +101,10 @@ void set_optimizer_state(FusedField& field, const py::array& first, const py::ar
 }
 
 bool adam_step(FusedField& field, float learning_rate, float beta1, float beta2, float epsilon,
-               float encoding_scale) {
+               float encoding_scale, float average_share) {
     const py::gil_scoped_release unlocked;
-    return field.adam_step({learning_rate, beta1, beta2, epsilon, encoding_scale});
+    return field.adam_step(
+        {learning_rate, beta1, beta2, epsilon, encoding_scale, average_share});
 }
 
 std::vector<std::string> available_isas() {
@@ -136,7 +129,8 @@ PYBIND11_MODULE(_kernel, module) {
         .def_property_readonly("threads", &FusedField::threads)
         .def_property_readonly("parameter_count",
                                [](const FusedField& f) { return f.shape().parameters; })
-        .def("parameters", parameters)
+        .def("parameters", get_flat<&FusedField::get_parameters>)
+        .def("average", get_flat<&FusedField::get_average>)
         .def("set_parameters", set_parameters, py::arg("parameters"))
         .def("gradients", get_flat<&FusedField::get_gradients>)
         .def("zero_gradients", &FusedField::zero_gradients, Free())
@@ -151,7 +145,7 @@ PYBIND11_MODULE(_kernel, module) {
              py::arg("want_points") = true)
         .def("adam_step", adam_step, py::arg("learning_rate"), py::arg("beta1") = 0.9f,
              py::arg("beta2") = 0.99f, py::arg("epsilon") = 1e-8f,
-             py::arg("encoding_scale") = 1.0f);
+             py::arg("encoding_scale") = 1.0f, py::arg("average_share") = 1.0f);
     bind_rays(module, field);
     bind_rgbd(module);
     bind_observation(module);

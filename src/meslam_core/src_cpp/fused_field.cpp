@@ -56,6 +56,7 @@ FusedField::FusedField(int width, int embedding, const std::string& isa, int thr
                                     "; it may be from 1 to 64");
     }
     parameters_ = AlignedArray<float>(shape_.parameters);
+    average_ = AlignedArray<float>(shape_.parameters);
     gradients_ = AlignedArray<float>(shape_.parameters);
     first_moment_ = AlignedArray<float>(shape_.parameters);
     second_moment_ = AlignedArray<float>(shape_.parameters);
@@ -72,12 +73,18 @@ void FusedField::get_parameters(float* to) const {
     copy(parameters_.data(), shape_.parameters, to);
 }
 
+void FusedField::get_average(float* to) const {
+    const Lock lock(mutex_);
+    copy(average_.data(), shape_.parameters, to);
+}
+
 void FusedField::set_parameters(const float* from) {
     const Lock lock(mutex_);
     if (!backend_->all_finite(from, shape_.parameters)) {
         throw std::invalid_argument("the parameters contain numbers that are not finite");
     }
     copy(from, shape_.parameters, parameters_.data());
+    copy(from, shape_.parameters, average_.data());
     backend_->pack(shape_, parameters_.data(), packed_.data());
 }
 
@@ -313,6 +320,11 @@ bool FusedField::adam_step(const AdamOptions& options) {
         update(0, shape_.weight1, options.learning_rate * options.encoding_scale);
         update(shape_.weight1, shape_.parameters, options.learning_rate);
         backend_->pack(shape_, parameters_.data(), packed_.data());
+        float* const average = average_.data();
+        const float* const latest = parameters_.data();
+        for (size_t i = 0; i < shape_.parameters; ++i) {
+            average[i] += options.average_share * (latest[i] - average[i]);
+        }
     }
     std::fill_n(gradients_.data(), shape_.parameters, 0.0f);
     return usable;

@@ -23,6 +23,8 @@ struct AdamOptions {
     float epsilon;
     // Factor on the learning rate of B and phi.
     float encoding_scale;
+    // Share of the average over the steps that the parameters after this one take.
+    float average_share;
 };
 
 // Rays in region coordinates with their samples; what lies at a sample is origin + along *
@@ -49,6 +51,8 @@ public:
     int threads() const { return pool_.threads(); }
 
     void get_parameters(float* to) const;
+    // What the parameters were on average over the last steps since set_parameters.
+    void get_average(float* to) const;
     void set_parameters(const float* from);
     // Sum of all backward calls since the last zero_gradients or adam_step.
     void get_gradients(float* to);
@@ -97,6 +101,7 @@ private:
     mutable std::mutex mutex_;
     ThreadPool pool_;
     AlignedArray<float> parameters_;
+    AlignedArray<float> average_;
     AlignedArray<float> gradients_;
     AlignedArray<float> first_moment_;
     AlignedArray<float> second_moment_;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from meslam_core.config import FieldConfig
 from meslam_core.errors import ConfigError
 from meslam_core.field import kernel
-from meslam_core.field.model import LUMA, TorchField
+from meslam_core.field.model import AVERAGE_SHARE, LUMA, FieldModel, TorchField
 from meslam_core.field.network import parameter_shapes
 
 ISAS = kernel.available_isas()
@@ -413,6 +414,24 @@ def test_loading_weights_forgets_the_optimiser() -> None:
     field.load_flat(weights)
     np.testing.assert_array_equal(field.flat(), weights)
     assert field.fused.optimizer_state()[2] == 0
+
+
+@pytest.mark.parametrize("make", [TorchField, kernel.KernelField])
+def test_the_average_follows_the_weights_and_begins_anew_with_others(
+    make: Callable[[FieldConfig], FieldModel],
+) -> None:
+    field = make(FieldConfig(width=64))
+    expected = field.average()
+    np.testing.assert_array_equal(expected, field.flat())
+    for _ in range(3):
+        (field.evaluate(torch.from_numpy(random_points(50))) ** 2).sum().backward()
+        assert field.step(1e-2)
+        expected += AVERAGE_SHARE * (field.flat() - expected)
+    assert np.abs(field.flat() - expected).max() > 1e-3
+    np.testing.assert_allclose(field.average(), expected, atol=1e-5)
+    weights = random_parameters(64, seed=5)
+    field.load_flat(weights)
+    np.testing.assert_array_equal(field.average(), weights)
 
 
 def test_cap_on_the_instruction_set(monkeypatch: pytest.MonkeyPatch) -> None:

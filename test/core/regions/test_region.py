@@ -36,9 +36,12 @@ def test_a_region_at_rest_is_on_disk_alone_and_still_answers_for_itself(room):
     assert region.at_rest
 
 
-def test_training_goes_on_after_a_rest_as_if_there_had_been_none(build_room, room):
+def test_training_goes_on_after_a_rest_from_the_average_of_the_last_steps(build_room, room):
     overrides = (f"field.backend={room.config.field.backend}", "keyframes.rays=1024")
     rested, other = room, build_room(20, overrides)
+    state = other.region.field.optimizer_state()
+    other.region.field.load_flat(other.region.weights())
+    other.region.field.load_optimizer_state(*state)
     rested.region.rest(ScratchFile(), 5)
     rested.region.wake()
     for each in (rested, other):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from meslam_core.config import FieldConfig, MappingConfig
 from meslam_core.errors import ConfigError
 from meslam_core.field.alignment import AlignmentSettings, NormalEquations
-from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON
+from meslam_core.field.model import ADAM_BETAS, ADAM_EPSILON, AVERAGE_SHARE
 from meslam_core.field.network import FieldNetwork
 from meslam_core.field.rendering import surface_offset_m
 
@@ -132,7 +132,9 @@ class KernelField:
 
     def step(self, learning_rate: float) -> bool:
         """One Adam step with the gradients since the last; False (and no step) if not finite."""
-        return self.fused.adam_step(learning_rate, *ADAM_BETAS, ADAM_EPSILON)
+        return self.fused.adam_step(
+            learning_rate, *ADAM_BETAS, ADAM_EPSILON, average_share=AVERAGE_SHARE
+        )
 
     def predict(self, points: Floats) -> Floats:
         """Values (N, 4) at points (N, 3) without gradients."""
@@ -263,6 +265,10 @@ class KernelField:
     def flat(self) -> Floats:
         """Copy of the weights in the layout of `network.parameter_shapes`."""
         return self.fused.parameters()
+
+    def average(self) -> Floats:
+        """Copy of the weights averaged over the last steps, in the layout of `flat`."""
+        return self.fused.average()
 
     def load_flat(self, vector: Floats) -> None:
         """Replace the weights and forget the optimiser's state.

@@ -13,6 +13,9 @@ from meslam_core.field.network import FieldNetwork
 
 ADAM_BETAS = (0.9, 0.99)
 ADAM_EPSILON = 1e-8
+# Share of the running average that each step's weights take: it follows them by some 50 steps,
+# and Adam's noise of a step to the next, which moves the whole surface by millimetres, is gone.
+AVERAGE_SHARE = 0.02
 LUMA = (0.299, 0.587, 0.114)
 
 Floats = NDArray[np.float32]
@@ -48,8 +51,12 @@ class FieldModel(Protocol):
         """Copy of the weights in the layout of `network.parameter_shapes`."""
         ...
 
+    def average(self) -> Floats:
+        """Copy of the weights averaged over the last steps, in the layout of `flat`."""
+        ...
+
     def load_flat(self, vector: Floats) -> None:
-        """Replace the weights and forget the optimiser's state."""
+        """Replace the weights and their average, and forget the optimiser's state."""
         ...
 
     def optimizer_state(self) -> tuple[Floats, Floats, int]:
@@ -71,6 +78,10 @@ class TorchField:
         self.device = device or torch.device("cpu")
         self.network = FieldNetwork(config, seed).to(self.device)
         self._optimizer = self._new_optimizer()
+        self._average = self._vector()
+
+    def _vector(self) -> torch.Tensor:
+        return torch.nn.utils.parameters_to_vector(self.network.parameters()).detach()
 
     def _new_optimizer(self) -> torch.optim.Adam:
         return torch.optim.Adam(
@@ -87,6 +98,7 @@ class TorchField:
         if finite:
             self._optimizer.param_groups[0]["lr"] = learning_rate
             self._optimizer.step()
+            self._average.lerp_(self._vector(), AVERAGE_SHARE)
         self._optimizer.zero_grad(set_to_none=True)
         return finite
 
@@ -112,9 +124,13 @@ class TorchField:
     def flat(self) -> Floats:
         return self.network.flat()
 
+    def average(self) -> Floats:
+        return np.asarray(self._average.cpu().numpy(), np.float32).copy()
+
     def load_flat(self, vector: Floats) -> None:
         self.network.load_flat(vector)
         self._optimizer = self._new_optimizer()
+        self._average = self._vector()
 
     def optimizer_state(self) -> tuple[Floats, Floats, int]:
         zeros = np.zeros_like(self.flat())

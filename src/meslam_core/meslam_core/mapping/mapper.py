@@ -214,7 +214,7 @@ class Mapper:
         if self.atlas is None:
             return
         working = self.atlas.working
-        self._viewed_field.load_flat(working.field.flat())
+        self._viewed_field.load_flat(working.field.average())
         mask = working.mask
         if working.unmarked:
             # Training is going to change the mask.

@@ -46,7 +46,7 @@ def region_beside(
     how = config.regions.initialisation
     if how == "random":
         return region
-    weights = parent.field.flat()
+    weights = parent.weights()
     if how == "continued":
         weights = shifted(weights, config.field.embedding, steps / parent.half_side_m)
     # The network answers as the parent's does, so it has seen as much.

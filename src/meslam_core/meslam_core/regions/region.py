@@ -150,7 +150,7 @@ class Region:
         )
 
     def rest(self, scratch: ScratchFile, keyframes: int = 0) -> None:
-        """Leave memory.
+        """Leave memory, with the network as it was on average over the last steps.
 
         Args:
             scratch: where to.
@@ -164,7 +164,7 @@ class Region:
         first, second, step = self.field.optimizer_state()
         flags = self.mask.flags.reshape(-1)
         record = scratch.put(
-            self.field.flat().tobytes(),
+            self.field.average().tobytes(),
             first.tobytes(),
             second.tobytes(),
             int(step).to_bytes(8, "little"),
@@ -177,7 +177,7 @@ class Region:
         self.confirmed, self.doubts = False, 0
 
     def wake(self) -> None:
-        """Come back into memory as it went.
+        """Come back into memory.
 
         Raises:
             OutputError: when the disk fails.
@@ -197,9 +197,9 @@ class Region:
         rest.scratch.release(rest.record)
 
     def weights(self) -> Floats:
-        """The network's parameters, copied from memory or read from disk."""
+        """The network's parameters averaged over the last steps, also those at rest."""
         if self._rest is None:
-            return self.field.flat().copy()
+            return self.field.average()
         data = self._rest.scratch.get(self._rest.record)
         count = parameter_count(self.field_config.width, self.field_config.embedding)
         return np.frombuffer(data, np.float32, count).copy()

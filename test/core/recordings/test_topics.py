@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from meslam_core.errors import ConfigError, RecordingError
 from meslam_core.recordings.topics import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPE,
@@ -93,3 +94,16 @@ def test_order_of_the_topics_does_not_matter() -> None:
         ("/camera/camera/infra1/image_rect_raw", "mono8"),
     ]
     assert chosen(*topics) == chosen(*reversed(topics))
+
+
+def test_topics_are_named_by_role():
+    named = RecordingTopics.from_texts(["color=/left/image", "depth=/depth/image"])
+    assert named == RecordingTopics(color="/left/image", depth="/depth/image")
+    for wrong in ("colour=/left/image", "/left/image", "depth="):
+        with pytest.raises(ConfigError, match=r"ROLE=TOPIC with one of color, depth"):
+            RecordingTopics.from_texts([wrong])
+
+
+def test_several_that_fit_name_the_option():
+    with pytest.raises(RecordingError, match=r"--topic color=/left/image"):
+        chosen(("/left/image", "rgb8"), ("/right/image", "rgb8"), ("/depth/image", "16UC1"))

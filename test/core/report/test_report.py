@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from meslam_core.cli import app
 from meslam_core.errors import EvaluationError
 from meslam_core.report import read_run, write_report
+from meslam_core.report.result_table import result_groups
 
 
 class Page(HTMLParser):
@@ -143,16 +144,11 @@ def test_several_runs_stand_side_by_side(make_run):
 
 
 def test_runs_of_different_recordings_are_not_ranked(make_run):
-    page = made(make_run("first"), make_run("second", recording="another", peak_rss_mb=12.0))
-    assert "n best" not in page.source
-
-
-def test_folders_of_one_name_are_told_apart(make_run, tmp_path):
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    page = made(make_run("a/out"), make_run("b/out"))
-    assert "a/out" in page.text
-    assert "b/out" in page.text
+    first = read_run(make_run("first"))
+    for recording, marks in (("memory", True), ("another", False)):
+        second = read_run(make_run(recording, recording=recording, peak_rss_mb=12.0))
+        lines = [line for group in result_groups([first, second]).values() for line in group]
+        assert any(any(line.best) for line in lines) == marks
 
 
 def test_what_a_run_has_not_is_said(make_run, tmp_path):
@@ -187,12 +183,14 @@ def test_another_recording_is_noticed(make_run, tmp_path):
     assert "so it is another" in made(folder, views=1).text
 
 
-def test_states_and_reasons_are_listed_as_text(make_run):
-    folder = make_run("<b>bold $x$")
+def test_names_and_reasons_are_shown_as_text_and_told_apart(make_run, tmp_path):
+    (tmp_path / "a").mkdir()
+    folder = make_run("a/<b>bold $x$")
     table = (folder / "frames.csv").read_text().splitlines()
     table[5] = table[5].replace(",OK,,", ",LOST,<script>alert(1)</script>,")
     (folder / "frames.csv").write_text("\n".join(table) + "\n")
-    page = made(folder, folder)
+    page = made(folder, make_run("<b>bold $x$"))
+    assert "a/<b>bold $x$" in page.text
     assert "LOST" in section(page, "tracking")
     assert "alert(1)" in page.text
     assert not page.tags & {"script", "b"}

@@ -64,6 +64,11 @@ class BackgroundMap:
         self._thread = threading.Thread(target=self._run, name="viewer map", daemon=True)
         self._thread.start()
 
+    @property
+    def process(self) -> MapProcess:
+        """That works at present."""
+        return self._process
+
     def begin(self) -> None:
         """Forget all regions; another map begins."""
         with self._lock:
@@ -153,7 +158,7 @@ class BackgroundMap:
     def _hand_over(self, index: RegionIndex, model: _Model) -> None:
         """Give the process a region; one that it cannot use is left out until the next version."""
         try:
-            self._process.ask({"do": "take", "name": f"region {index}"}, model.data)
+            self._process.ask({"do": "take", "index": index}, model.data)
         except MapError as error:
             logger.warning("the viewer leaves a region out: %s", error)
             with self._lock:

@@ -42,7 +42,7 @@ class MapWorker:
         """The answer to one request; `error` in it says why there is none."""
         try:
             if request["do"] == "take":
-                return self._take(request["name"], blocks[0])
+                return self._take(tuple(request["index"]), blocks[0])
             if request["do"] == "forget":
                 self._regions.clear()
                 return {}, b""
@@ -54,9 +54,11 @@ class MapWorker:
         except MeslamError as error:
             return {"error": str(error)}, b""
 
-    def _take(self, name: str, data: bytes) -> Answer:
+    def _take(self, index: RegionIndex, data: bytes) -> Answer:
         """Keep a region in the place of an earlier version of it."""
-        region = decode(data, name)
+        region = decode(data, f"region {index}")
+        if region.index != index:
+            raise MapError(f"what was sent as region {index} is region {region.index}")
         self._regions[region.index] = PlacedRegion(region, "auto")
         return {}, b""
 

@@ -109,8 +109,7 @@ class Panel:
             "Spacing [cm]", *SPACING_RANGE_CM, 0.5, 100.0 * self._controls.mesh_resolution_m
         )
         self._spacing.on_update(self._take_spacing)
-        self._suffix = gui.add_dropdown("Format", FORMATS)
-        self._download = gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
+        self._download = gui.add_button_group("Download", FORMATS)
         self._download.on_click(self._take_download)
 
     def _take_pause(self, _: object) -> None:
@@ -133,13 +132,12 @@ class Panel:
         if spacing_cm is not None:
             self._controls.mesh_resolution_m = spacing_cm / 100.0
 
-    def _take_download(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+    def _take_download(self, event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
         """Send the map's mesh to one viewer's browser, which saves it; nothing is written here."""
-        suffix = self._suffix.value
+        suffix = self._download.value
         if event.client is None or suffix not in FORMATS:
             return
         resolution_m = self._controls.mesh_resolution_m
-        self._download.disabled = True
         notice = event.client.add_notification(
             "Mesh", f"is made with a spacing of {100 * resolution_m:g} cm", loading=True
         )
@@ -150,7 +148,6 @@ class Panel:
             return
         finally:
             notice.remove()
-            self._download.disabled = False
         event.client.send_file_download(f"meslam{suffix}", content, save_immediately=True)
 
 

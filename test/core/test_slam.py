@@ -162,3 +162,22 @@ def test_walking_out_of_a_small_region_creates_and_enters_the_next(quick_config,
     assert len(slam.atlas.regions) > 1
     assert slam.atlas.working.index != (0, 0, 0)
     assert all(result.state is TrackingState.OK for result in results)
+
+
+def test_who_comes_back_after_a_minute_makes_no_new_keyframes(
+    quick_config, room_frames, room_poses
+):
+    there = list(range(0, 16, 2))
+    slam, period_ns = Slam(quick_config), 66_000_000
+    numbers = [*there, *reversed(there), *there]
+    stamps = [n * period_ns + (0 if n < len(there) else 100 * 10**9) for n in range(len(numbers))]
+    frames = [replace(room_frames[k], stamp_ns=t) for k, t in zip(numbers, stamps, strict=True)]
+    results = walk(slam, frames)
+    assert [result.is_keyframe for result in results[: len(there)]].count(True) > 2
+    assert not any(result.is_keyframe for result in results[len(there) :])
+    assert all(result.state is TrackingState.OK for result in results)
+    truth = np.array([room_poses[k][:3, 3] for k in numbers])
+    assert np.linalg.norm(slam.trajectory().positions - truth, axis=1).max() < 0.03
+    # Frames are tied to the keyframes that they come back to, and so is how certain they are.
+    first, last = results[len(there)].covariance, results[2 * len(there)].covariance
+    assert np.trace(last[:3, :3]) < np.trace(first[:3, :3])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ import pytest
 from meslam_core.config import MeslamConfig
 from meslam_core.mapping.frame_training import FIRST_STEPS_SHARE, MADE_UP_A_FRAME
 from meslam_core.odometry import make_odometry
-from meslam_core.slam import Slam
+from meslam_core.slam import Slam, TrackingState
 
 FIRST, LEAST, STEPS = 100, 3, 8
 FIRST_LEAST = math.ceil(FIRST_STEPS_SHARE * FIRST)
@@ -185,3 +185,15 @@ def test_what_training_raises_reaches_the_caller(config, offered, monkeypatch):
     slam.process(*offered[1])
     with pytest.raises(FloatingPointError, match="no numbers"):
         slam.wait()
+
+
+def test_where_the_map_lags_behind_valid_odometry_keyframes_are_trained_and_the_frame_is_not(
+    config, offered
+):
+    slam = Slam(config, frames_wait=lambda: True)
+    steps_of(slam, offered[:3])
+    keyframes = len(slam.keyframes)
+    nearer = [(replace(f, depth_m=0.8 * f.depth_m), odometry) for f, odometry in offered[3:5]]
+    assert steps_of(slam, nearer) == [STEPS, STEPS]
+    assert slam.state is TrackingState.DEGRADED
+    assert len(slam.keyframes) == keyframes

@@ -213,6 +213,8 @@ class Slam:
             is_keyframe = self._mapper.train(
                 pending.sampled, orthonormalized(pose), result.odometry
             )
+        elif self._lags(pending):
+            self._mapper.replay()
         if self.atlas is not None:
             self._remember(pending, is_keyframe)
         return replace(
@@ -222,11 +224,20 @@ class Slam:
             mapping_ms=trained.duration_ms,
         )
 
+    def _lags(self, pending: _Pending) -> bool:
+        """Whether odometry leads to where a frame does not fit a map that has seen the place.
+
+        The frame must not train the map, but keyframes from before may have had too little time.
+        """
+        odometry, alignment = pending.result.odometry, pending.tracked.alignment
+        led = odometry is not None and odometry.valid
+        return led and alignment is not None and not self.tracking.lost
+
     def _remember(self, pending: _Pending, is_keyframe: bool) -> None:
         reference, relative = pending.reference, pending.T_reference_camera
         if is_keyframe:
             if len(self._history):
-                self._history.hand_over(reference, relative)
+                self._history.hand_over(relative)
             reference, relative = len(self.keyframes) - 1, np.eye(4)
         result = pending.result
         self._history.add(
@@ -255,9 +266,13 @@ class Slam:
         """From the next training on take the numbers of steps from another configuration."""
         self._mapper.change_steps(mapping)
 
-    def finish(self) -> None:
-        """Refine once more over everything seen; then mark the observed space anew."""
-        self._mapper.finish()
+    def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Refine once more over everything seen; then mark the observed space anew.
+
+        Args:
+            progress: called with the steps that are done and their total.
+        """
+        self._mapper.finish(progress)
 
     def settle(self) -> None:
         """Mark the observed space anew where the refined keyframes saw it."""
@@ -309,7 +324,7 @@ class Slam:
 
     def _reference(self, tracked: TrackedPose) -> int:
         """Number of the keyframe that a pose was found by."""
-        return self._history.newest_keyframe if tracked.reference is None else tracked.reference
+        return self._mapper.reference if tracked.reference is None else tracked.reference
 
     def _covariance(self, tracked: TrackedPose) -> NDArray[np.float64]:
         """Covariance (6, 6) of a pose: its place in the map, and the map's own error."""

@@ -147,3 +147,18 @@ def test_a_view_that_shares_little_with_those_of_a_region_is_recognised(turn_deg
     walk.ask(region, latest)
     assert region.confirmed
     assert np.linalg.norm(log(inverse(back) @ walk.keyframes.pose(latest[0]))[:3]) < 0.02
+
+
+@pytest.mark.parametrize(("off_m", "confirmed"), [(0.0, True), (0.1, False)])
+def test_an_old_keyframes_image_tells_whether_a_region_is_where_it_is_believed(off_m, confirmed):
+    walk = Walk()
+    for pose in POSES:
+        walk.atlas.add_keyframe(walk.add(pose, pose)[0])
+    region = walk.atlas.working
+    region.confirmed, region.known_until = False, len(POSES)
+    walk.atlas.settle()
+    back = POSES[2] @ exp(np.array([0.03, 0.0, 0.02, 0.0, 0.02, 0.0]))
+    believed = exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ back
+    assert walk.recogniser.confirm(2, frame_at(back, 99, LARGE), believed) is confirmed
+    assert region.confirmed is confirmed
+    assert len(walk.keyframes) == len(POSES)

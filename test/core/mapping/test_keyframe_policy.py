@@ -8,7 +8,7 @@ import torch
 from data.textured_room import frame_at
 
 from meslam_core.field.rendering import render
-from meslam_core.mapping.keyframe_policy import KeyframePolicy
+from meslam_core.mapping.keyframe_policy import REVISITED_AFTER_NS, KeyframePolicy
 from meslam_core.mapping.keyframes import rays_at
 from meslam_core.se3 import Pose, exp
 
@@ -78,3 +78,19 @@ def test_distances_are_those_of_the_volume_rendering(mapped_room, number):
     error = policy.rendered_distances(mapped_room.region, pose, rays) - dense.distance_m.numpy()
     assert np.median(np.abs(error)) < 0.005
     assert np.mean(np.abs(error) < 0.03) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("twist", "found"), [({}, True), ({"x": 0.1, "yaw": 0.1}, True), ({"roll": 0.5}, False)]
+)
+def test_a_keyframe_from_long_ago_stands_for_what_is_seen_there_again(
+    mapped_room, reference, twist, found
+):
+    policy = KeyframePolicy(mapped_room.config.keyframes, mapped_room.config.field)
+    keyframes, region = mapped_room.keyframes, mapped_room.region
+    later_ns = keyframes.stamps_ns[-1] + REVISITED_AFTER_NS + 1
+    pose = moved(reference, **twist)
+    revisited = policy.revisited(region, keyframes, later_ns, pose)
+    assert revisited == (REFERENCE if found else None)
+    soon_ns = keyframes.stamps_ns[0] + REVISITED_AFTER_NS
+    assert policy.revisited(region, keyframes, soon_ns, pose) is None

@@ -8,13 +8,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from meslam_core.camera import PinholeCamera
+from meslam_core.frame import RgbdFrame
 from meslam_core.loop.pose_graph import optimised_poses
 from meslam_core.mapping.covisibility import CovisibilityLinker
 from meslam_core.mapping.keyframe_links import MeasuredMotion
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.regions.atlas import RegionAtlas
 from meslam_core.regions.region import Region
-from meslam_core.se3 import inverse, rotation_angle
+from meslam_core.se3 import Pose, inverse, rotation_angle
 
 log = logging.getLogger(__name__)
 
@@ -74,14 +75,32 @@ class RegionRecogniser:
                 return
             yield
 
+    def confirm(self, keyframe: int, frame: RgbdFrame, T_map_camera: Pose) -> bool:
+        """Whether a frame is where it is believed to be, as a keyframe's image tells.
+
+        The regions that were trained with the keyframe are then known to be where they are.
+
+        Args:
+            keyframe: number of one whose images are kept.
+            frame: whose view it shares.
+            T_map_camera: (4, 4) where that is believed to be.
+        """
+        T_map_keyframe = self._keyframes.pose(keyframe)
+        guess = inverse(T_map_keyframe) @ T_map_camera
+        found = self._linker.find(keyframe, self._linker.prepare(self._linker.image(frame)), guess)
+        if found is None or _is_far(inverse(guess) @ found.T_target_source):
+            return False
+        for region in self._atlas.doubtful:
+            region.confirmed = keyframe < region.known_until and keyframe in region.keyframes
+        return True
+
     def _believe(self, links: list[MeasuredMotion]) -> None:
         keyframes = self._keyframes
         # The last one agreed with the others.
         link = links[-1]
         found = keyframes.pose(link.first) @ link.T_first_second
         apart = inverse(keyframes.pose(link.second)) @ found
-        far = float(np.linalg.norm(apart[:3, 3]))
-        if far > TOLERATED_M or rotation_angle(apart) > TOLERATED_RAD:
+        if _is_far(apart):
             before = keyframes.poses()
             after = optimised_poses(before, keyframes.links, links)
             everyone = np.arange(1, len(after))
@@ -95,7 +114,13 @@ class RegionRecogniser:
             log.info(
                 "keyframe %d was recognised %.1f cm from where it was believed to be",
                 link.second,
-                far * 100,
+                float(np.linalg.norm(apart[:3, 3])) * 100,
             )
         for each in links:
             keyframes.add_link(each.first, each.second, each.T_first_second)
+
+
+def _is_far(apart: Pose) -> bool:
+    """Whether two poses differ by more than training evens out."""
+    far = float(np.linalg.norm(apart[:3, 3])) > TOLERATED_M
+    return far or rotation_angle(apart) > TOLERATED_RAD

@@ -11,7 +11,7 @@ from meslam_core.config import MeslamConfig
 from meslam_core.loop.recognition import RegionRecogniser
 from meslam_core.loop.relocalisation import Relocaliser
 from meslam_core.mapping.joint_optimizer import JointOptimizer
-from meslam_core.mapping.keyframe_registration import KeyframeRegistration, NewKeyframe
+from meslam_core.mapping.keyframe_registration import KeyframeRegistration, NewKeyframe, Revisit
 from meslam_core.mapping.keyframes import Rays
 from meslam_core.mapping.training_worker import Training, TrainingWorker
 from meslam_core.regions.atlas import RegionAtlas
@@ -84,8 +84,18 @@ class FrameTraining:
         self._steps_owed = self._optimizer.config.first_iterations
         self._worker.start(self._train_first)
 
+    @property
+    def recognises(self) -> bool:
+        """Whether the latest frame that seemed to revisit a keyframe shows that place."""
+        return self._registration.recognises
+
     def start(
-        self, stamp_ns: int, current: Rays, T_map_current: Pose, keyframe: NewKeyframe | None
+        self,
+        stamp_ns: int,
+        current: Rays,
+        T_map_current: Pose,
+        keyframe: NewKeyframe | None,
+        revisit: Revisit | None = None,
     ) -> None:
         """Begin to train with a frame.
 
@@ -94,6 +104,7 @@ class FrameTraining:
             current: rays of the frame, camera frame.
             T_map_current: (4, 4) its pose.
             keyframe: what it is as a keyframe, where it is one.
+            revisit: where it comes back to an old keyframe.
         """
         config = self._optimizer.config
         steps = config.iterations if keyframe is None else config.keyframe_iterations
@@ -101,7 +112,17 @@ class FrameTraining:
         steps += min(self._steps_owed, MADE_UP_A_FRAME)
         self._trained = self._next_to_train()
         self._worker.start(
-            partial(self._train, self._trained, least, steps, current, T_map_current, keyframe)
+            partial(
+                self._train, self._trained, least, steps, current, T_map_current, keyframe, revisit
+            )
+        )
+
+    def replay(self) -> None:
+        """Begin to train with keyframes alone: the map lags behind what they have seen."""
+        steps = self._optimizer.config.keyframe_iterations
+        self._trained = self._next_to_train()
+        self._worker.start(
+            partial(self._train, self._trained, steps, steps, None, None, None, None)
         )
 
     def wait(self) -> bool:
@@ -142,9 +163,10 @@ class FrameTraining:
         regions: list[Region],
         least: int,
         steps: int,
-        current: Rays,
-        pose: Pose,
+        current: Rays | None,
+        pose: Pose | None,
         keyframe: NewKeyframe | None,
+        revisit: Revisit | None,
     ) -> Training:
         """Train the working region, which comes first, and the other one half as long.
 
@@ -154,9 +176,11 @@ class FrameTraining:
         # While frames wait, either a view is marked or a registration made.
         registers = self._turn % 2
         self._atlas.settle(marks=not (registers and self._frames_wait()))
-        if keyframe is not None:
+        if keyframe is not None and pose is not None:
             self._registration.add(keyframe)
             pose = self._registration.proceed(registers) @ pose
+        if revisit is not None and pose is not None:
+            self._registration.revisit(revisit, pose)
         losses = self._optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)
         )

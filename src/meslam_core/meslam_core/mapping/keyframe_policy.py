@@ -19,6 +19,10 @@ COARSE_SAMPLES = 24
 FINE_SAMPLES = 8
 # A rendered ray costs as much as many projected points; this share of them decides as surely.
 RENDERED_EVERY = 2
+# A keyframe that is so old stands for what is seen again within so many times the distances at
+# which a new one is made: who drives the same ways for hours needs no more of them.
+REVISITED_AFTER_NS = 60_000_000_000
+REVISITED_SLACK = 2.0
 
 
 class KeyframePolicy:
@@ -38,6 +42,7 @@ class KeyframePolicy:
         camera: PinholeCamera,
         T_map_camera: Pose,
         rays: Rays,
+        slack: float = 1.0,
     ) -> bool:
         """Whether a frame shows enough that its reference keyframe and the map do not.
 
@@ -47,17 +52,44 @@ class KeyframePolicy:
             camera: of the frame.
             T_map_camera: (4, 4) of the frame.
             rays: some of the frame's, camera frame.
+            slack: the limits to the reference are so many times as wide.
         """
         offset = inverse(keyframes.pose(reference)) @ T_map_camera
-        if np.linalg.norm(offset[:3, 3]) > self.config.translation_m:
+        if np.linalg.norm(offset[:3, 3]) > slack * self.config.translation_m:
             return True
-        if np.rad2deg(rotation_angle(offset)) > self.config.rotation_deg:
+        if np.rad2deg(rotation_angle(offset)) > slack * self.config.rotation_deg:
             return True
-        if self._overlap(camera, offset, rays) < self.config.overlap:
+        if self._overlap(camera, offset, rays) < self.config.overlap / slack:
             return True
         some = slice(None, None, RENDERED_EVERY)
         rendered = Rays(rays.directions[some], rays.distances_m[some], rays.colors[some])
         return self._agreement(region, T_map_camera, rendered) < self.config.agreement
+
+    def revisited(
+        self, region: Region, keyframes: KeyframeStore, stamp_ns: int, T_map_camera: Pose
+    ) -> int | None:
+        """The nearest keyframe from long ago that shows what a frame shows; None without any.
+
+        Args:
+            region: the working region.
+            keyframes: the store.
+            stamp_ns: of the frame's image [ns].
+            T_map_camera: (4, 4) of the frame.
+        """
+        # Of an earlier session there are no images.
+        known = [k for k in region.keyframes if k >= keyframes.fixed]
+        old = [k for k in known if stamp_ns - keyframes.stamps_ns[k] > REVISITED_AFTER_NS]
+        if not old:
+            return None
+        rotations, translations = keyframes.pose_arrays()
+        far = np.linalg.norm(translations[old] - T_map_camera[:3, 3], axis=1)
+        far /= REVISITED_SLACK * self.config.translation_m
+        cosines = 0.5 * (np.einsum("kij,ij->k", rotations[old], T_map_camera[:3, :3]) - 1.0)
+        turned = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
+        turned /= REVISITED_SLACK * self.config.rotation_deg
+        apart = np.maximum(far, turned)
+        nearest = int(np.argmin(apart))
+        return old[nearest] if apart[nearest] < 1.0 else None
 
     def _overlap(self, camera: PinholeCamera, T_reference_camera: Pose, rays: Rays) -> float:
         """Share of the points that project into the reference keyframe's image."""

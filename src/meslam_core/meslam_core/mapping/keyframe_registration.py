@@ -20,6 +20,8 @@ from meslam_core.se3 import Pose, inverse
 
 # A new keyframe: its number, its images and its sample of rays, camera frame.
 NewKeyframe = tuple[int, RgbdFrame, Rays]
+# A frame that comes back to an old keyframe: that one's number, and the frame's images.
+Revisit = tuple[int, RgbdFrame]
 # While frames wait, a keyframe is registered with so many older ones at most, and so many keyframes
 # may be behind with that; then the oldest goes without.
 LEAST_ATTEMPTS = 3
@@ -39,6 +41,7 @@ class KeyframeRegistration:
     Attributes:
         recogniser: asks regions that woke, where loops are closed.
         relocaliser: finds a lost camera, while no training runs.
+        recognises: whether the latest frame that seemed to revisit a keyframe shows that place.
     """
 
     def __init__(
@@ -55,6 +58,7 @@ class KeyframeRegistration:
         self._asking: Iterator[None] | None = None
         self._linker: CovisibilityLinker | None = None
         self.recogniser: RegionRecogniser | None = None
+        self.recognises = True
         if config.keyframes.links:
             self._linker = CovisibilityLinker(self._keyframes, config, scratch)
             if config.regions.close_loops:
@@ -63,6 +67,7 @@ class KeyframeRegistration:
 
     def add(self, keyframe: NewKeyframe) -> None:
         """Take a new keyframe, to be registered when `proceed` comes to it."""
+        self.recognises = True
         if self._linker is None:
             return
         number, frame, rays = keyframe
@@ -74,6 +79,22 @@ class KeyframeRegistration:
             region = doubtful[number % len(doubtful)]
             self._asking = self.recogniser.ask(region, number, frame.camera, rays)
         self._behind.append(self._links(self._linker, number, frame.camera, rays))
+
+    def revisit(self, revisit: Revisit, T_map_camera: Pose) -> None:
+        """Ask whether a frame shows the place that it comes back to, where that is in doubt.
+
+        Regions that know the place are then no longer in doubt. Where it does not show it, the
+        next frame may become a keyframe, which the recogniser asks for.
+
+        Args:
+            revisit: the frame, and the keyframe.
+            T_map_camera: (4, 4) where it is believed to be.
+        """
+        self.recognises = True
+        if self.recogniser is None or not self._atlas.doubtful:
+            return
+        keyframe, frame = revisit
+        self.recognises = self.recogniser.confirm(keyframe, frame, T_map_camera)
 
     def proceed(self, least: int = 1) -> Pose:
         """Make the registrations that are due.

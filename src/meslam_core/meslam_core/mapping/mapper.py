@@ -17,7 +17,7 @@ from meslam_core.loop.relocalisation import Relocaliser
 from meslam_core.mapping.frame_training import FrameTraining
 from meslam_core.mapping.joint_optimizer import JointOptimizer
 from meslam_core.mapping.keyframe_chain import KeyframeChain
-from meslam_core.mapping.keyframe_policy import KeyframePolicy
+from meslam_core.mapping.keyframe_policy import REVISITED_SLACK, KeyframePolicy
 from meslam_core.mapping.keyframe_registration import NewKeyframe
 from meslam_core.mapping.keyframes import KeyframeStore, Rays, rays_at
 from meslam_core.mapping.refinement import REFINING_STEPS, Refinement
@@ -72,6 +72,8 @@ class Mapper:
         optimizer: trains them.
         atlas: the regions; None before the first frame.
         remembered: so many keyframes stand for an earlier session's.
+        reference: number of the keyframe whose place the latest frame is tied to: the newest one,
+            or one from long ago where the camera has come back to it.
 
     Raises:
         MapError: when the map cannot be continued.
@@ -105,10 +107,11 @@ class Mapper:
         self._refinement: Refinement | None = None
         # What tracking sees of the working region while training changes the original.
         self._viewed_field = make_field(config.field, seed)
-        self.remembered = 0
+        self.remembered = self.reference = 0
         if continuation is not None:
             self._map_into(continuation.atlas(config, self.keyframes, seed, self._scratch))
             self.remembered = len(self.keyframes)
+            self.reference = self.remembered - 1
             self._uncertainty.update(self.keyframes)
 
     @property
@@ -181,19 +184,40 @@ class Mapper:
                 self.look()
             return False
         self.atlas.update(T_map_camera[:3, 3])
+        revisited = self._revisited(sampled.frame, T_map_camera)
         is_keyframe = self._policy.is_keyframe(
             self.atlas.working,
             self.keyframes,
-            len(self.keyframes) - 1,
+            len(self.keyframes) - 1 if revisited is None else revisited,
             sampled.frame.camera,
             T_map_camera,
             sampled.rays(self._policy.PIXELS),
+            1.0 if revisited is None else REVISITED_SLACK,
         )
         keyframe = self._add_keyframe(sampled, T_map_camera, odometry) if is_keyframe else None
+        revisit = None
+        if revisited is not None and not is_keyframe:
+            self.reference, revisit = revisited, (revisited, sampled.frame)
+            # Odometry over all that is revisited would tie two keyframes with the drift of it.
+            self._chain.cut()
         current = sampled.rays(CURRENT_FRAME_RAYS)
         self.look()
-        self._training.start(sampled.frame.stamp_ns, current, T_map_camera, keyframe)
+        self._training.start(sampled.frame.stamp_ns, current, T_map_camera, keyframe, revisit)
         return is_keyframe
+
+    def replay(self) -> None:
+        """Train with keyframes alone, as a map that lags behind them needs it."""
+        if self._training is not None and self._trains:
+            self._training.replay()
+
+    def _revisited(self, frame: RgbdFrame, T_map_camera: Pose) -> int | None:
+        """A keyframe from long ago that shows what a frame shows, as far as is known."""
+        assert self.atlas is not None
+        assert self._training is not None
+        if not self._training.recognises:
+            return None
+        working = self.atlas.working
+        return self._policy.revisited(working, self.keyframes, frame.stamp_ns, T_map_camera)
 
     def wait(self) -> Training:
         """Wait for the training that runs, and show what it did; what the latest one did."""
@@ -238,10 +262,15 @@ class Mapper:
             self._refinement.train(steps, progress)
             self.look()
 
-    def finish(self) -> None:
-        """Refine once more over everything seen; then mark the observed space anew."""
+    def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Refine once more over everything seen; then mark the observed space anew.
+
+        Args:
+            progress: called with the steps that are done and their total.
+        """
         total = self.refining_steps
         for done in range(0, total, REFINING_STEPS):
+            progress(done, total)
             self.refine(min(REFINING_STEPS, total - done), done / total)
         self.settle()
 
@@ -279,5 +308,6 @@ class Mapper:
         assert self.atlas is not None
         rays = sampled.rays(self._config.keyframes.rays)
         number = self._chain.add(sampled.frame.stamp_ns, pose, rays, odometry)
+        self.reference = number
         self.atlas.add_keyframe(number)
         return number, sampled.frame, rays

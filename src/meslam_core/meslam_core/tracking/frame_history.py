@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +73,8 @@ class FrameHistory:
         self._online = np.zeros((64, 4, 4))
         self._known = np.zeros(64, np.bool_)
         self._measured: deque[_Measured] = deque(maxlen=MAX_ODOMETRY_GAP)
-        # By keyframe: how the next one was tracked in it, and when.
-        self._handovers: dict[int, tuple[Pose, int]] = {}
+        # By frame that became a keyframe: how it was tracked in the keyframe before.
+        self._handovers: dict[int, Pose] = {}
         # Number of the first frame since the path was last broken off.
         self._begun = 0
 
@@ -116,11 +117,10 @@ class FrameHistory:
         """The next frame is where it was found, whatever the frames before say of their motion."""
         self._begun = self._count
 
-    def hand_over(self, reference: int, T_reference_next: Pose) -> None:
+    def hand_over(self, T_reference_next: Pose) -> None:
         """The next frame becomes a keyframe: how it was tracked in the one before, (4, 4)."""
-        if self._begun == self._count:
-            return
-        self._handovers[reference] = (T_reference_next, self._count)
+        if self._begun < self._count:
+            self._handovers[self._count] = T_reference_next
 
     @property
     def last_stamp_ns(self) -> int:
@@ -191,15 +191,11 @@ class FrameHistory:
                 self._references[: self._count], self._relative[: self._count]
             )
         starts = np.flatnonzero(np.diff(self._references[: self._count], prepend=-1))
-        for start in starts:
-            reference = int(self._references[start])
-            if reference not in self._handovers:
-                continue
-            T_reference_next, end = self._handovers[reference]
-            if end >= self._count:
+        for start, end in pairwise(starts.tolist()):
+            if end not in self._handovers:
                 continue
             T_map_next = self.keyframe_pose(int(self._references[end]))
-            T_next_reference = inverse(T_reference_next)
+            T_next_reference = inverse(self._handovers[end])
             duration = max(int(stamps[end] - stamps[start]), 1)
             for number in range(start + 1, end):
                 through_next = T_map_next @ T_next_reference @ self._relative[number]

@@ -38,6 +38,9 @@ class Watcher:
         if name == self._at:
             self._action()
 
+    def refined(self, done: int, total: int) -> None:
+        assert 0 <= done < total
+
 
 def covered(frame):
     return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))

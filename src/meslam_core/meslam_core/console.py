@@ -101,6 +101,11 @@ class RunBar:
         if self._task is not None:
             self._progress.update(self._task, description=name)
 
+    def refined(self, done: int, total: int) -> None:
+        """Let the bar tell how far refining is, from its start."""
+        if self._task is not None:
+            self._progress.update(self._task, completed=done, total=total, details="steps")
+
 
 @contextmanager
 def counting_bar(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:

@@ -45,6 +45,10 @@ class RunProgress(Protocol):
         """Another stage begins: "refining" or "writing"."""
         ...
 
+    def refined(self, done: int, total: int) -> None:
+        """So many of the steps of refining are done."""
+        ...
+
 
 class Silent:
     """Progress that nobody follows."""
@@ -56,6 +60,9 @@ class Silent:
         """Nothing."""
 
     def stage(self, name: str) -> None:
+        """Nothing."""
+
+    def refined(self, done: int, total: int) -> None:
         """Nothing."""
 
 
@@ -236,7 +243,7 @@ class _Loop:
             self.online_s = time.perf_counter() - started
             if not self.interrupted:
                 self._progress.stage("refining")
-                self.slam.finish()
+                self.slam.finish(self._progress.refined)
         self.wall_s = time.perf_counter() - started
 
     def _feed(self, stop: threading.Event) -> None:

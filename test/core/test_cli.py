@@ -407,6 +407,24 @@ def test_a_full_disk_behind_standard_output_is_told(folder):
     assert "Traceback" not in done.stderr
 
 
+def test_an_impatient_user_is_not_kept_waiting_by_threads():
+    program = (
+        "import sys, threading, time\n"
+        "from meslam_core import cli\n"
+        "@cli.app.command()\n"
+        "def stuck() -> None:\n"
+        "    threading.Thread(target=time.sleep, args=(250,)).start()\n"
+        "    raise KeyboardInterrupt\n"
+        "sys.argv[1:] = ['stuck']\n"
+        "cli.main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=200
+    )
+    assert done.returncode == 130
+    assert done.stderr == "meslam: interrupted; what was not complete is not kept\n"
+
+
 def test_names_do_not_rule_the_terminal(tmp_path):
     recording = tmp_path / "\x1b[2Jnight\nfall.mcap"
     assert_refused(meslam("info", recording), "\\x1b[2Jnight\\nfall.mcap", "does not exist")

@@ -105,14 +105,16 @@ class Bench:
         return Ended(process.returncode, stdout, stderr)
 
 
-def wait_for(condition: Callable[[], object], what: str, limit_s: float = 100.0) -> None:
-    """Wait until something holds.
+def wait_for(condition: Callable[[], object], what: str, limit_s: float = 150.0) -> None:
+    """Wait until something holds; time in which this process was stopped does not count.
 
     Raises:
         TimeoutError: when it never does.
     """
-    deadline = time.monotonic() + limit_s
+    waited_s, looked = 0.0, time.monotonic()
     while not condition():
-        if time.monotonic() > deadline:
+        now = time.monotonic()
+        waited_s, looked = waited_s + min(now - looked, 1.0), now
+        if waited_s > limit_s:
             raise TimeoutError(f"{what} did not happen within {limit_s:.0f} s")
         time.sleep(0.02)

@@ -124,10 +124,11 @@ def _stopped(status: int) -> Problem:
 
 
 def _twice(seen: Seen) -> str:
-    """The second request ends it at once: a map or none, and nothing half."""
+    """The second request ends it at once, the map is whole or there is none."""
     (told,) = seen.facts["ended"]
-    expected = (INTERRUPTED, -signal.SIGINT, 1, 0)
-    return "" if told.status in expected else f"exit status {told.status}"
+    if told.unexplained:
+        return str(told.unexplained)
+    return "" if told.status in (INTERRUPTED, 0) else f"exit status {told.status}"
 
 
 _fault = faults_of(Group.STORAGE)

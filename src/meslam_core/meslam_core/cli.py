@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import re
 import shlex
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,6 +32,7 @@ from meslam_core.cli_options import (
 )
 from meslam_core.command_output import (
     BAD_INPUT,
+    INTERRUPTED,
     complain,
     exit_after_run,
     print_entries,
@@ -77,6 +80,11 @@ class _Commands(TyperGroup):
                 raise
             complain(f"the system refuses: {error}; free what it lacks and try again")
             raise typer.Exit(BAD_INPUT) from error
+        except KeyboardInterrupt:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            complain("interrupted; what was not complete is not kept")
+            # Python would wait for the threads that compute, and abort when asked once more.
+            os._exit(INTERRUPTED)
 
 
 app = typer.Typer(
@@ -175,25 +183,27 @@ def run(
     config = MeslamConfig.from_overrides(overrides or [], preset)
     chosen = _frame_range(frames)
     intrinsics = camera_of(camera)
-    from meslam_core.threads import limit_threads
+    from meslam_core.console import RunBar, error_console, waiting
 
-    limit_threads(config.runtime.threads)
-    from meslam_core import pipeline
-    from meslam_core.console import RunBar, error_console
-    from meslam_core.continuation import read_continuation
-    from meslam_core.recordings import open_recording
+    with waiting("loading"):
+        from meslam_core.threads import limit_threads
 
-    options = pipeline.RunOptions(
-        chosen,
-        realtime,
-        truth,
-        hand_eye=lever_arm,
-        odometry=odometry,
-        continuation=read_continuation(stored, start_pose),
-        seed=seed,
-        command=shlex.join(["meslam", *sys.argv[1:]]),
-    )
-    source = open_recording(recording, intrinsics, topics_of(topics))
+        limit_threads(config.runtime.threads)
+        from meslam_core import pipeline
+        from meslam_core.continuation import read_continuation
+        from meslam_core.recordings import open_recording
+
+        options = pipeline.RunOptions(
+            chosen,
+            realtime,
+            truth,
+            hand_eye=lever_arm,
+            odometry=odometry,
+            continuation=read_continuation(stored, start_pose),
+            seed=seed,
+            command=shlex.join(["meslam", *sys.argv[1:]]),
+        )
+        source = open_recording(recording, intrinsics, topics_of(topics))
     try:
         with RunBar(error_console()) as bar:
             outcome = pipeline.run(source, config, out, options, bar)
@@ -217,12 +227,15 @@ def evaluate(
 
     As the TUM benchmark does: paired by stamp, aligned by a rigid motion, RMSE of the rest.
     """
-    from meslam_core.evaluation.report import trajectory_entries
-    from meslam_core.trajectory import read_tum
+    from meslam_core.console import waiting
 
-    entries = trajectory_entries(
-        read_tum(trajectory), read_tum(truth), tolerance_s=tolerance, hand_eye=lever_arm
-    )
+    with waiting("comparing"):
+        from meslam_core.evaluation.report import trajectory_entries
+        from meslam_core.trajectory import read_tum
+
+        entries = trajectory_entries(
+            read_tum(trajectory), read_tum(truth), tolerance_s=tolerance, hand_eye=lever_arm
+        )
     print_entries(entries, as_json)
 
 

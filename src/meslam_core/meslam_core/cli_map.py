@@ -52,11 +52,14 @@ def query(
     1/m; NaN where unknown), distance (float32, m: to the nearest surface, positive behind it; NaN
     where unknown) and color (3 uint8, RGB; meaningful near surfaces, 0 where unknown).
     """
+    from meslam_core.console import counting_bar, error_console
     from meslam_core.point_query import answer, read_points, write_answers
 
     wanted = read_points(points)
     union = _union(stored)
-    write_answers(out, answer(union.neural_map(), wanted))
+    with counting_bar(error_console(), "points") as progress:
+        answers = answer(union.neural_map(), wanted, progress)
+    write_answers(out, answers)
     typer.echo(f"{out}: {len(wanted)} answers")
     _exit_if_damaged(stored, union)
 
@@ -71,17 +74,23 @@ def merge(
     The first map's lattice becomes the merged map's: a robot that continues it extends that one.
     Regions of all maps are kept as they are and blended where they overlap.
     """
+    from meslam_core.console import waiting
+
     union = _union(stored)
-    count = union.save(out)
+    with waiting("writing the map"):
+        count = union.save(out)
     typer.echo(f"{out}: {count} regions of {len(stored)} maps")
     _exit_if_damaged(stored, union)
 
 
 def describe(paths: list[Path], as_json: bool) -> None:
     """Print what maps hold."""
-    from meslam_core.map_info import describe_maps, region_table
+    from meslam_core.console import waiting
 
-    facts, damages = describe_maps(paths)
+    with waiting("reading the map"):
+        from meslam_core.map_info import describe_maps, region_table
+
+        facts, damages = describe_maps(paths)
     if as_json:
         print_entries(facts, as_json)
     else:
@@ -92,9 +101,12 @@ def describe(paths: list[Path], as_json: bool) -> None:
 
 
 def _union(paths: list[Path]) -> MapUnion:
-    from meslam_core.map.union import MapUnion
+    from meslam_core.console import waiting
 
-    return MapUnion(paths)
+    with waiting("reading the map"):
+        from meslam_core.map.union import MapUnion
+
+        return MapUnion(paths)
 
 
 def _exit_if_damaged(paths: list[Path], union: MapUnion) -> None:

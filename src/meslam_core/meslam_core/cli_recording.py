@@ -33,13 +33,17 @@ def info(
     if stored or len(paths) > 1:
         cli_map.describe(paths, as_json)
         return
-    from meslam_core.recordings import describe, open_recording
+    from meslam_core.console import waiting
 
-    recording = open_recording(path, camera_of(camera), topics_of(topics))
-    try:
-        print_entries(describe(recording), as_json)
-    finally:
-        recording.close()
+    with waiting(f"looking into {path.name}"):
+        from meslam_core.recordings import describe, open_recording
+
+        recording = open_recording(path, camera_of(camera), topics_of(topics))
+        try:
+            facts = describe(recording)
+        finally:
+            recording.close()
+    print_entries(facts, as_json)
 
 
 @app.command()
@@ -50,11 +54,12 @@ def convert(
     topics: TopicOption = None,
 ) -> None:
     """Convert a recording to an .mcap file with depth registered to colour."""
-    from meslam_core.console import counting_bar, error_console
+    from meslam_core.console import counting_bar, error_console, waiting
     from meslam_core.recordings import convert as write_frames
     from meslam_core.recordings import open_recording
 
-    recording = open_recording(source, camera_of(camera), topics_of(topics))
+    with waiting(f"looking into {source.name}"):
+        recording = open_recording(source, camera_of(camera), topics_of(topics))
     try:
         with counting_bar(error_console(), "frames") as progress:
             count = write_frames(recording, target, progress)
@@ -87,11 +92,12 @@ def simulate(
 
     FILE.truth.txt holds the poses in TUM format, FILE.surface.ply the surface.
     """
-    from meslam_core.console import counting_bar, error_console
+    from meslam_core.console import counting_bar, error_console, waiting
     from meslam_core.simulation.simulator import simulate as simulated
     from meslam_core.simulation.writer import truth_path, write_simulation
 
-    simulation = simulated(scene, duration, seed, fps=fps, motion_blur_s=motion_blur)
+    with waiting("building the scene"):
+        simulation = simulated(scene, duration, seed, fps=fps, motion_blur_s=motion_blur)
     with counting_bar(error_console(), "frames") as progress:
         write_simulation(simulation, out, progress)
     typer.echo(f"{out}: {len(simulation)} frames; true poses in {truth_path(out)}")

@@ -123,3 +123,10 @@ def counting_bar(console: Console, description: str) -> Iterator[Callable[[int, 
             progress.update(task, completed=done, total=total)
 
         yield show
+
+
+@contextmanager
+def waiting(description: str) -> Iterator[None]:
+    """A sign of life on a terminal while something takes its time, without an end in sight."""
+    with error_console().status(description):
+        yield

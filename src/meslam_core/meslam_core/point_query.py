@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from meslam_core.errors import MapError
 from meslam_core.map.files import cannot_write, produce_atomically
 from meslam_core.map.neural_map import NeuralMap
 
+# Points that are answered at a time: a second or less.
+PORTION = 1_000_000
 ANSWER = np.dtype(
     [
         ("occupancy", np.int8),
@@ -52,18 +55,33 @@ def read_points(path: Path) -> NDArray[np.float64]:
     return points.astype(np.float64)
 
 
-def answer(neural_map: NeuralMap, points: NDArray[np.floating]) -> NDArray[Any]:
-    """What a map knows of points (N, 3) in its frame: (N,) of dtype `ANSWER`."""
+def answer(
+    neural_map: NeuralMap,
+    points: NDArray[np.floating],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> NDArray[Any]:
+    """What a map knows of points (N, 3) in its frame: (N,) of dtype `ANSWER`.
+
+    Args:
+        neural_map: that is asked.
+        points: in its frame [m].
+        progress: called with the number of answers and their total.
+    """
     answers = np.zeros(len(points), ANSWER)
-    if not len(points):
-        return answers
+    for start in range(0, len(points), PORTION):
+        portion = slice(start, start + PORTION)
+        _fill(answers[portion], neural_map, points[portion])
+        progress(min(start + PORTION, len(points)), len(points))
+    return answers
+
+
+def _fill(answers: NDArray[Any], neural_map: NeuralMap, points: NDArray[np.floating]) -> None:
     answers["occupancy"], answers["probability"] = neural_map.occupancy(points)
     values = neural_map.values(points)
     offset = values.distance - np.float32(neural_map.surface_level)
     answers["distance"] = offset * np.float32(neural_map.truncation_m)
     answers["density"] = neural_map.density_scale * np.maximum(values.distance, 0.0)
     answers["color"] = np.nan_to_num(np.round(255.0 * values.color)).astype(np.uint8)
-    return answers
 
 
 def write_answers(path: Path, answers: NDArray[Any]) -> None:

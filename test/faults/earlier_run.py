@@ -25,7 +25,9 @@ def mapped(bench: Bench, name: str = "results") -> Path:
 def again(bench: Bench, out: Path, *options: object, **how: Any) -> Seen:
     """Run the walk once more into a folder."""
     done = bench.meslam("run", material.bag(bench), "--out", out, *QUICK, *options, **how)
-    return seen_of(bench, done, report=report_in(out), manifest=manifest_of(out))
+    # Where it failed, the report is the earlier run's.
+    report = report_in(out) if done.status == 0 else {}
+    return seen_of(bench, done, report=report, manifest=manifest_of(out))
 
 
 def started(out: Path, process: subprocess.Popen[str]) -> None:
@@ -59,5 +61,8 @@ def kept(then: Problem) -> Problem:
 
 
 def manifest_of(out: Path) -> bytes:
-    file = out / MAP / "manifest.json"
-    return file.read_bytes() if file.exists() else b""
+    """A run's manifest; empty where there is none."""
+    try:
+        return (out / MAP / "manifest.json").read_bytes()
+    except OSError:
+        return b""

@@ -38,8 +38,10 @@ def run(bench: Bench, recording: Path, *options: object, **how: Any) -> Seen:
 
 def report_in(out: Path) -> dict[str, Any]:
     """What a run reported; empty where it did not."""
-    file = out / "report.json"
-    return dict(json.loads(file.read_text())) if file.exists() else {}
+    try:
+        return dict(json.loads((out / "report.json").read_text()))
+    except OSError:
+        return {}
 
 
 def seen_of(bench: Bench, *ended: Ended, **facts: Any) -> Seen:

@@ -142,9 +142,9 @@ _fault = faults_of(Group.STORAGE)
 PLACES = (
     _fault(
         "disk-full-in-the-save",
-        "the disk has room for 12 kB when a run wants to replace a map of 24 kB",
+        "the disk has room for 32 kB when a run wants to write results and a map of 48 kB",
         "status 2 names the folder; the earlier results are untouched, nothing is left behind",
-        _disk_full(12),
+        _disk_full(32),
         _nothing_left(kept(ended("No space left", status=BAD_INPUT))),
     ),
     _fault(

@@ -272,7 +272,7 @@ FAULTS = (
         "metadata.yaml of a kilobyte that unfolds to a terabyte",
         "refused before memory is taken; the recording is named",
         _yaml_bomb,
-        refused("walk"),
+        refused("recording", "metadata"),
     ),
     _fault(
         "list-leads-elsewhere",

@@ -19,7 +19,7 @@ import pytest
 from data.textured_room import CAMERA
 from typer.testing import CliRunner
 
-from meslam_core import __version__
+from meslam_core import __version__, point_query
 from meslam_core.cli import app
 from meslam_core.map.store import MapStore
 from meslam_core.recordings import open_recording
@@ -351,6 +351,17 @@ def test_query_answers_about_points(stored_map, tmp_path):
     assert answers["occupancy"][2] == -1
     assert answers["probability"][2] == 0.5
     assert np.isnan(answers["density"][2])
+
+
+def test_query_in_portions_answers_the_same(stored_map, tmp_path, monkeypatch):
+    np.save(tmp_path / "points.npy", np.random.default_rng(0).uniform(-1.0, 2.0, (50, 3)))
+    for name, portion in (("whole.npy", 100), ("parts.npy", 7)):
+        monkeypatch.setattr(point_query, "PORTION", portion)
+        paths = ["--points", tmp_path / "points.npy", "--out", tmp_path / name]
+        assert meslam("query", stored_map, *paths).exit_code == 0
+    whole, parts = (np.load(tmp_path / name) for name in ("whole.npy", "parts.npy"))
+    for name in whole.dtype.names:
+        np.testing.assert_allclose(whole[name], parts[name], atol=1e-5)
 
 
 def test_query_takes_no_points(stored_map, tmp_path):

@@ -26,7 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -183,13 +183,15 @@ def follow(path: Path, minutes: float, every_s: float, overrides: Sequence[str])
 def looked_at(pid: int) -> tuple[int, int, float]:
     """Threads and open files of a process, and what its files without a name take [MB]."""
     process = Path(f"/proc/{pid}")
-    scratch = 0
-    entries = list((process / "fd").iterdir())
-    for entry in entries:
-        found = entry.stat()
-        if stat.S_ISREG(found.st_mode) and not found.st_nlink:
-            scratch += found.st_blocks * 512
-    return len(list((process / "task").iterdir())), len(entries), scratch / 1e6
+    files = scratch = 0
+    for entry in (process / "fd").iterdir():
+        # It goes on meanwhile, and may close some.
+        with suppress(FileNotFoundError):
+            found = entry.stat()
+            files += 1
+            if stat.S_ISREG(found.st_mode) and not found.st_nlink:
+                scratch += found.st_blocks * 512
+    return len(list((process / "task").iterdir())), files, scratch / 1e6
 
 
 def measure(path: Path, minutes: float, every_s: float, overrides: Sequence[str]) -> list[Sample]:

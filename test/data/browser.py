@@ -23,6 +23,9 @@ WINDOW = {"width": 760, "height": 420}
 WAIT_S = 90.0
 POLL_MS = 250
 
+WORKING = (107, 205, 124)
+"""The working region's colour, as the browser draws its lines."""
+
 Pixels = NDArray[np.uint8]
 
 

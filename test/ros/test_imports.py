@@ -17,6 +17,7 @@ HEAVY = {"torch", "open3d", "gtsam", "matplotlib"}
         ("bag_player_node", set()),
         ("region_manager_node", set()),
         ("odometry_node", set()),
+        ("viewer_node", set()),
         ("map_server_node", {"torch"}),
         ("tracking_node", {"torch", "gtsam"}),
     ],

@@ -21,6 +21,7 @@ from meslam_ros.parameters import FIXED, LIVE, declare_config, declare_settings,
 from meslam_ros.parameters import node_settings as entries_of
 from meslam_ros.region_manager_node import RegionManagerNode
 from meslam_ros.tracking_node import TrackingNode
+from meslam_ros.viewer_settings import ViewerSettings
 
 SECTIONS = list(MeslamConfig().to_mapping())
 KINDS = [
@@ -31,6 +32,7 @@ KINDS = [
     node_settings.RegionManagerSettings,
     node_settings.MapServerSettings,
     node_settings.PlayerSettings,
+    ViewerSettings,
 ]
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL,

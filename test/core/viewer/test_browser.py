@@ -10,16 +10,14 @@ import numpy as np
 import pytest
 import trimesh
 from core.viewer.conftest import FRAMES, IMAGE_COLORS
-from data.browser import checkbox, count, open_browser, open_page, wait_for, wait_for_text
+from data.browser import WORKING, checkbox, count, open_browser, open_page, wait_for, wait_for_text
 from playwright.sync_api import Page
 
-from meslam_core.viewer.canvas import STATE_COLORS
 from meslam_core.viewer.finished_run import FinishedRun
-from meslam_core.viewer.scene import RegionState, ViewControls
+from meslam_core.viewer.scene import ViewControls
 from meslam_core.viewer.viewer import Viewer
 
 BALL = (230, 26, 26)
-WORKING = STATE_COLORS[RegionState.WORKING]
 MANY, SOME = 300, 40
 
 
@@ -46,7 +44,6 @@ def page(viewer: Viewer, requested: list[str]) -> Iterator[Page]:
 
 def test_mesh_regions_camera_and_figures_are_seen(page: Page) -> None:
     wait_for(page, "the ball", lambda seen: count(seen, BALL) > MANY)
-    wait_for(page, "the working region's box", lambda seen: count(seen, WORKING) > SOME)
     wait_for(page, "the first image", lambda seen: count(seen, IMAGE_COLORS[0], 12) > MANY)
     for text in ("FINISHED", "12.5 frames/s", f"{FRAMES} tracked", "bytes/m³", "triangles"):
         wait_for_text(page, text)
@@ -61,7 +58,11 @@ def test_nothing_is_fetched_from_elsewhere(page: Page, viewer: Viewer, requested
 
 def test_layers_can_be_hidden(page: Page) -> None:
     checkbox(page, "Mesh")
-    wait_for(page, "a view without mesh", lambda seen: count(seen, BALL) < SOME)
+    seen = wait_for(page, "a view without mesh", lambda seen: count(seen, BALL) < SOME)
+    assert count(seen, WORKING, 12) > SOME
+    checkbox(page, "Regions")
+    wait_for(page, "a view without regions", lambda seen: count(seen, WORKING, 12) == 0)
+    checkbox(page, "Regions")
     checkbox(page, "Mesh")
     wait_for(page, "the ball", lambda seen: count(seen, BALL) > MANY)
 

@@ -110,7 +110,10 @@ def _two_systems(bench: Bench) -> Seen:
     )
     try:
         started(out, process)
+        # However long the second one takes to start, the first one is still at work.
+        process.send_signal(signal.SIGSTOP)
         second = bench.meslam("run", material.bag(bench), "--out", out, *QUICK)
+        process.send_signal(signal.SIGCONT)
         first_status = process.wait()
     finally:
         process.kill()

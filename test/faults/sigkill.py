@@ -52,6 +52,8 @@ SETTINGS = (
 )
 """A short run whose map has several regions."""
 POLL_S = 0.0005
+RESULTS_S = 0.3
+"""Processor time from the writing of the map to the end, at most."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ def trial(runs: Runs, series: str, number: int, duration_s: float) -> Kill:
     generator = Random(f"{series} {number}")
     before = MapStore(runs.out / MAP).load().map_id
     after_writing = series == "results"
-    instant = generator.uniform(0.0, 0.1 if after_writing else 1.0)
+    instant = generator.uniform(0.0, RESULTS_S if after_writing else 1.0)
     in_time = runs.killed(number + 1, instant * (1 if after_writing else duration_s), after_writing)
     stage = runs.stage() if in_time else "ended"
     try:
@@ -191,7 +193,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Do the trials; exit status 1 when anything was lost."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--trials", type=int, default=200, help="over whole runs")
-    parser.add_argument("--results", type=int, default=50, help="while results are written")
+    parser.add_argument("--results", type=int, default=80, help="while results are written")
     parser.add_argument("--record", type=Path, default=RECORD, help="where the table is kept")
     given = parser.parse_args(arguments)
     kills = _read(given.record)

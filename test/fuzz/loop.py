@@ -53,12 +53,22 @@ class Finding:
 
 @dataclass
 class Outcome:
-    """What fuzzing a target came to."""
+    """What fuzzing a target came to.
+
+    Attributes:
+        executions: inputs tried.
+        refused: of these, with an error that says so.
+        seconds: of processor time [s].
+        corpus: inputs that were kept, as they were answered in a new way.
+        elapsed_s: time that passed, but for that of a machine that stood still [s].
+        findings: by kind.
+    """
 
     executions: int = 0
     refused: int = 0
     seconds: float = 0.0
     corpus: int = 0
+    elapsed_s: float = 0.0
     findings: dict[str, Finding] = field(default_factory=dict)
 
     def add(self, other: Outcome) -> None:
@@ -66,6 +76,7 @@ class Outcome:
         self.executions += other.executions
         self.refused += other.refused
         self.seconds += other.seconds
+        self.elapsed_s += other.elapsed_s
         self.corpus = max(self.corpus, other.corpus)
         for finding in other.findings.values():
             self.note(finding)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,11 @@ sys.path.insert(0, str(ROOT / "test"))
 from fuzz.all_targets import TARGETS  # noqa: E402
 from fuzz.case_file import case_name, write_case  # noqa: E402
 from fuzz.loop import Outcome  # noqa: E402
-from fuzz.target import Target  # noqa: E402
 from fuzz.worker import fuzz_in_process  # noqa: E402
 
 RECORD = ROOT / "docs/reliability/fuzzing.json"
 FINDINGS = ROOT / "out/fuzz"
+LEAST_S = 0.1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("targets", nargs="*", help=f"of: {', '.join(TARGETS)}; all by default")
     parser.add_argument("--minutes", type=float, default=1.0, help="of processor time, in total")
+    parser.add_argument("--turn", type=float, default=5.0, help="of one target, in seconds")
     parser.add_argument("--record", type=Path, default=RECORD, help="where counts add up")
     parser.add_argument("--findings", type=Path, default=FINDINGS, help="folder for inputs")
     given = parser.parse_args(arguments)
@@ -40,9 +41,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     record = _read(given.record)
     given.findings.mkdir(parents=True, exist_ok=True)
     found = 0
-    for target, seconds in _turns(chosen, 60.0 * given.minutes):
-        entry = record.setdefault(target.name, {"what": target.what} | _nothing())
-        outcome = fuzz_in_process(target, entry["rounds"], seconds)
+    for target in chosen:
+        record.setdefault(target.name, {"what": target.what} | _nothing())
+    left_s = 60.0 * given.minutes
+    while left_s > 0.0:
+        # Whoever had the least so far: the work is shared out however often it is interrupted.
+        target = min(chosen, key=lambda target: record[target.name]["seconds"])
+        entry = record[target.name]
+        outcome = fuzz_in_process(target, entry["rounds"], min(given.turn, left_s))
+        left_s -= max(outcome.seconds, LEAST_S)
         _add(entry, outcome)
         for finding in outcome.findings.values():
             write_case(given.findings / case_name(finding), finding)
@@ -59,18 +66,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if found else 0
 
 
-def _turns(targets: list[Target], seconds: float) -> Iterator[tuple[Target, float]]:
-    """Targets in turn and the processor time of each turn [s]."""
-    left = seconds
-    while left > 0.0:
-        share = min(1.0, left / sum(target.slice_s for target in targets))
-        for target in targets:
-            yield target, share * target.slice_s
-        left -= share * sum(target.slice_s for target in targets)
-
-
 def _nothing() -> dict[str, Any]:
-    return {"rounds": 0, "executions": 0, "refused": 0, "seconds": 0.0, "findings": 0, "kinds": {}}
+    return {
+        "rounds": 0,
+        "executions": 0,
+        "refused": 0,
+        "seconds": 0.0,
+        "elapsed_s": 0.0,
+        "findings": 0,
+        "kinds": {},
+    }
 
 
 def _add(entry: dict[str, Any], outcome: Outcome) -> None:
@@ -78,6 +83,7 @@ def _add(entry: dict[str, Any], outcome: Outcome) -> None:
     entry["executions"] += outcome.executions
     entry["refused"] += outcome.refused
     entry["seconds"] = round(entry["seconds"] + outcome.seconds, 1)
+    entry["elapsed_s"] = round(entry["elapsed_s"] + outcome.elapsed_s, 1)
     for finding in outcome.findings.values():
         entry["kinds"][finding.kind] = entry["kinds"].get(finding.kind, 0) + finding.count
     entry["findings"] = len(entry["kinds"])

@@ -24,7 +24,6 @@ class Target:
         mutate: makes an input out of another and the whole corpus.
         refusals: errors that say that an input is refused.
         seconds: of processor time that one input may take at most [s].
-        slice_s: of processor time that is spent before another target's turn [s].
     """
 
     name: str
@@ -34,4 +33,3 @@ class Target:
     mutate: Callable[[Parts, list[Parts], Random], Parts] = mutated_parts
     refusals: tuple[type[Exception], ...] = ()
     seconds: float = 5.0
-    slice_s: float = 20.0

@@ -27,6 +27,7 @@ MEMORY_BYTES = 1 << 30
 SILENCE_S = 60.0
 """Native code is not interrupted by the limit on an input's time: this one holds for it."""
 POLL_S = 0.2
+LONGEST_POLL_S = 1.0
 MAX_DEATHS = 5
 _COUNTS = struct.Struct("<QQdQ")
 
@@ -62,8 +63,8 @@ def _run_child(target: Target, seed: str, seconds: float) -> tuple[Outcome, bool
             except BaseException:
                 (folder / "log").write_text(traceback.format_exc())
                 os._exit(1)
-        status = _watched(process, counts)
-        outcome = Outcome(*_COUNTS.unpack_from(counts))
+        status, elapsed_s = _watched(process, counts)
+        outcome = Outcome(*_COUNTS.unpack_from(counts), elapsed_s)
         log = (folder / "log").read_text(errors="replace")
         if status > 0:
             raise RuntimeError(f"fuzzing {target.name} failed: {log}")
@@ -113,17 +114,20 @@ def _prepare(folder: Path) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _watched(process: int, counts: mmap.mmap) -> int:
-    """Exit status of a process, negative for a signal; it is killed when an input takes too long.
+def _watched(process: int, counts: mmap.mmap) -> tuple[int, float]:
+    """Exit status of a process, negative for a signal, and the time that passed [s].
 
-    Waiting is counted in polls: the time of a machine that stands still does not count.
+    It is killed when an input takes too long. A poll that took long tells of a machine that stood
+    still, whose time does not count.
     """
-    silence, last = 0.0, -1
+    silence, last, elapsed_s = 0.0, -1, 0.0
     while True:
         found, status = os.waitpid(process, os.WNOHANG)
         if found:
-            return os.waitstatus_to_exitcode(status)
+            return os.waitstatus_to_exitcode(status), elapsed_s
+        started = time.monotonic()
         time.sleep(POLL_S)
+        elapsed_s += min(time.monotonic() - started, LONGEST_POLL_S)
         number = _COUNTS.unpack_from(counts)[0]
         silence = silence + POLL_S if number == last else 0.0
         last = number

@@ -18,6 +18,7 @@ from meslam_ros import node_settings, topics
 from meslam_ros.call_service import fill, interface
 from meslam_ros.launch_plan import ARGUMENTS
 from meslam_ros.parameters import node_settings as entries_of
+from meslam_ros.viewer_settings import ViewerSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [
@@ -34,6 +35,7 @@ NODES = {
     "map_server_node": (node_settings.MapFrameSettings, node_settings.MapServerSettings),
     "bag_player_node": (node_settings.PlayerSettings,),
     "camera_node": (node_settings.CameraSettings,),
+    "viewer_node": (node_settings.FrameSettings, ViewerSettings),
 }
 SERVICES = {f"/{value}": name for name, value in vars(topics).items() if name.isupper()}
 

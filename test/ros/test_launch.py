@@ -49,6 +49,7 @@ def test_without_arguments_the_system_starts_for_a_camera_that_runs_already() ->
         {"recording": "room.mcap"},
         {"camera": "meslam", "rviz": "true"},
         {"camera": "realsense2"},
+        {"viewer": "true"},
         {"odometry_topic": "/wheels/odom", "recording": "room.mcap"},
     ],
 )
@@ -109,6 +110,12 @@ def test_rviz_shows_the_system_of_a_namespace() -> None:
     assert Path(rviz.arguments[1]).is_file()
     assert planned(rviz="true")["rviz2"].remappings == ()
     assert planned(rviz="true", recording="a")["rviz2"].parameters["use_sim_time"] is True
+
+
+def test_the_page_is_served_on_request_for_this_computer_alone() -> None:
+    viewer = planned(viewer="true", camera_name="front", viewer_port="9000")["viewer_node"]
+    assert viewer.parameters == {"base_frame": "front_link", "host": "127.0.0.1", "port": 9000}
+    assert not viewer.essential
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,11 @@
 # The words of the README. `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup build test demo benchmark benchmark-quick faults lint format typecheck config clean
+.PHONY: help setup build test demo benchmark benchmark-quick faults lint format typecheck config fuzz sigkill audit clean
 
 RECORDING ?=
 PYTEST_ARGS ?=
+MINUTES ?= 60
 BENCHMARK_ARGS ?=
 FAULTS ?=
 IN_ENV := source env.bash &&
@@ -41,6 +42,15 @@ format: setup  ## correct style and formatting
 
 typecheck: setup  ## check the types of the core
 	@$(IN_ENV) mypy
+
+fuzz: setup  ## fuzz every parser for MINUTES=60 of processor time; counts add up in docs/reliability
+	@$(IN_ENV) python test/fuzz/run.py --minutes $(MINUTES)
+
+sigkill: setup  ## kill whole runs at random instants and load the maps; results in docs/reliability
+	@$(IN_ENV) python test/faults/sigkill.py && python test/faults/sigkill_nodes.py
+
+audit:  ## look up known vulnerabilities of all pinned dependencies; needs the network
+	@tools/audit.sh
 
 config: setup  ## write the parameter files and their reference from the typed configuration
 	@$(IN_ENV) python -m meslam_core.config_reference

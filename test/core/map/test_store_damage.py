@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +59,19 @@ def test_a_missing_region_is_named_and_the_rest_loads(saved: MapStore) -> None:
     loaded = saved.load()
     assert [region.index for region in loaded.regions] == [(1, 0, 0)]
     assert missing.name in loaded.warnings[0]
+
+
+def test_what_is_no_file_is_named_and_the_rest_loads(saved: MapStore) -> None:
+    first, second = region_files(saved)
+    first.unlink()
+    for make in (first.mkdir, lambda: os.mkfifo(first), lambda: first.symlink_to("/dev/zero")):
+        make()
+        loaded = saved.load()
+        assert [region.index for region in loaded.regions] == [(1, 0, 0)]
+        (warning,) = loaded.warnings
+        assert first.name in warning
+        first.rmdir() if first.is_dir() else first.unlink()
+    assert second.exists()
 
 
 def test_two_region_files_exchanged(saved: MapStore) -> None:

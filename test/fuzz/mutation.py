@@ -20,7 +20,7 @@ _NUMBER = re.compile(rb"-?[0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]+)?")
 _ODD_NUMBERS = [
     *(str(value).encode() for value in _EDGES),
     *(b"-%d" % value for value in _EDGES),
-    *(b"nan", b"NaN", b"inf", b"-Infinity", b"1e308", b"1e309", b"-1e400", b"1e-320", b"1e99999"),
+    *(b"nan", b"NaN", b"inf", b"-Infinity", b"1e308", b"1e309", b"-1e400", b"1e-320", b"1e9999999"),
     *(b"", b"-", b".", b"0x10", b"1_0", b"1,5", b"\xd9\xa3", b"\xc2\xb2", b"9" * 400, b"9" * 5000),
 ]
 _ODD_WORDS = [

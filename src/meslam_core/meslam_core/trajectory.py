@@ -175,8 +175,9 @@ def parsed_stamp(text: str) -> int:
         seconds = Decimal(text)
     except InvalidOperation as error:
         raise ValueError(f"{text!r} is not a number of seconds") from error
-    # Compared before it is multiplied: a large exponent would make millions of digits.
-    if not seconds.is_finite() or abs(seconds) > MAX_STAMP_NS // NANOSECONDS:
+    limit = MAX_STAMP_NS // NANOSECONDS
+    # Only comparisons take any exponent; a large one would make millions of digits.
+    if not seconds.is_finite() or not -limit <= seconds <= limit:
         raise ValueError(f"{text!r} seconds are out of range")
     return int((seconds * NANOSECONDS).to_integral_value())
 

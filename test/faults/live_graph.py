@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,6 +11,7 @@ from typing import Any
 from data.ros_camera import CameraDriver, Messages
 from data.textured_room import PERIOD_NS, frame_at, path
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.publisher import Publisher
 
 from meslam_core.frame import RgbdFrame
 from meslam_interfaces.msg import RegionModel, TrackingStatus
@@ -23,9 +23,9 @@ from meslam_ros.processes import NodeProcess, ros_arguments
 from meslam_ros.qos import STREAM, latched
 
 NODES = ("map_server_node", "region_manager_node", "odometry_node", "tracking_node")
-STARTING_S = 120.0
 ANSWER_S = 90.0
-RESEND_S = 5.0
+SLICE_S = 0.5
+RESEND_S, RESENDS = 5.0, 24
 THERE = path(8, step_m=0.008, step_deg=0.4)
 POSES = [*THERE, *THERE[-2:0:-1]]
 QUICK: dict[str, Any] = {
@@ -40,6 +40,7 @@ QUICK: dict[str, Any] = {
     "transform_timeout_s": 1.0,
 }
 
+STREAM_LATCHED = latched(50)
 Change = Callable[[Messages], None]
 
 
@@ -69,6 +70,8 @@ class LiveGraph:
         self.processes: dict[str, NodeProcess] = {}
         self.reports: dict[str, DiagnosticStatus] = {}
         self.stamp_ns = NANOSECONDS
+        self.map_id = ""
+        self._deaf = False
         self._views = [frame_at(pose) for pose in POSES]
         self._place = 0
         self._parameters = {
@@ -98,7 +101,22 @@ class LiveGraph:
 
     def until(self, condition: Callable[[], bool], what: str, timeout_s: float = ANSWER_S) -> None:
         """Wait for something, or fail with the nodes' logs."""
-        assert self.client.spin_until(condition, timeout_s), f"never {what}\n{self.logs()}"
+        assert self.comes_true(condition, timeout_s), f"never {what}\n{self.logs()}"
+
+    def comes_true(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Listen until something holds; time in which this process was stopped does not count."""
+        return any(
+            self.client.spin_until(condition, SLICE_S) for _ in range(round(timeout_s / SLICE_S))
+        )
+
+    @property
+    def next_ns(self) -> int:
+        """Stamp of the next view [ns]."""
+        return self.stamp_ns + PERIOD_NS
+
+    def wait(self, seconds: float) -> None:
+        """Listen for a while [s]."""
+        self.client.spin_until(lambda: False, seconds)
 
     def view(self) -> RgbdFrame:
         """The next view of the room, a frame's time later."""
@@ -108,28 +126,33 @@ class LiveGraph:
 
     def send(self, change: Change = lambda messages: None) -> int:
         """Send the next view, changed as a fault wants it; its stamp [ns]."""
+        # What came until now may have been somebody else's.
+        self._deaf = False
         return self.camera.send(self.view(), change)
 
     def track(self, change: Change = lambda messages: None) -> TrackingStatus:
         """Send the next view, again while nobody listens; tracking's answer."""
         before = len(self.client.statuses)
-        deadline = time.monotonic() + STARTING_S
-        while time.monotonic() < deadline and self.processes["tracking_node"].status is None:
+        for _ in range(RESENDS):
             self.send(change)
-            if self.client.spin_until(lambda: len(self.client.statuses) > before, RESEND_S):
+            if self.comes_true(lambda: len(self.client.statuses) > before, RESEND_S):
                 return self.client.statuses[-1]
+            if self.processes["tracking_node"].status is not None:
+                break
         raise AssertionError(f"tracking does not answer\n{self.logs()}")
 
-    def track_well(self, count: int = 2, tries: int = 15) -> TrackingStatus:
+    def track_well(self, count: int = 2, tries: int = 120) -> TrackingStatus:
         """Send good views until so many in a row are tracked well; the last answer."""
-        row, answers = 0, []
+        row = 0
         for _ in range(tries):
             status = self.track()
-            answers.append((status.state, status.reason))
             row = row + 1 if status.state == TrackingStatus.OK else 0
             if row == count:
                 return status
-        raise AssertionError(f"not tracked well again: {answers}\n{self.logs()}")
+            self.wait(PERIOD_NS / NANOSECONDS)
+        raise AssertionError(
+            f"not tracked well again: state {status.state}, {status.reason!r}\n{self.logs()}"
+        )
 
     def served(self) -> dict[tuple[int, ...], int]:
         """The map server's regions and their versions."""
@@ -141,11 +164,25 @@ class LiveGraph:
         """Wait until the map is refined, published and served; its identity."""
         self.until(lambda: self.client.settled, "settled")
         map_id = self.client.statuses[-1].map_id
-        expected = {
-            index: model.version for (id_, index), model in self.models.items() if id_ == map_id
-        }
-        self.until(lambda: self.served() == expected and self.map_id == map_id, "served")
+        self.until(lambda: self.served() == self.published(map_id), "served")
+        assert self.map_id == map_id
         return map_id
+
+    def published(self, map_id: str) -> dict[tuple[int, ...], int]:
+        """A map's regions as tracking published them, and their versions."""
+        return {index: m.version for (of, index), m in self.models.items() if of == map_id}
+
+    @contextmanager
+    def foreign(self, message: type, topic: str, nodes: int = 1) -> Iterator[Publisher]:
+        """A publisher that is none of the system's, as soon as so many nodes hear it."""
+        publisher = self.client.node.create_publisher(message, topic, STREAM_LATCHED)
+        self._deaf = True
+        try:
+            own = message is RegionModel
+            self.until(lambda: publisher.get_subscription_count() >= nodes + own, "heard")
+            yield publisher
+        finally:
+            self.client.node.destroy_publisher(publisher)
 
     def reported(self, node: str, *words: str) -> str:
         """Wait until a node's diagnosis has all these words; the diagnosis."""
@@ -177,7 +214,8 @@ class LiveGraph:
         return "\n".join(f"--- {name}\n{p.output()}" for name, p in self.processes.items())
 
     def _take_model(self, model: RegionModel) -> None:
-        self.models[model.map_id, tuple(map(int, model.index))] = model
+        if not self._deaf:
+            self.models[model.map_id, tuple(map(int, model.index))] = model
 
     def _take_reports(self, message: DiagnosticArray) -> None:
         for status in message.status:

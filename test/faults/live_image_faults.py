@@ -119,7 +119,7 @@ def no_colour_for_a_while(graph: LiveGraph) -> str:
         info, _, image = graph.camera.messages(view, to_stamp(view.stamp_ns))
         graph.camera.info.publish(info)
         graph.camera.depth.publish(image)
-        graph.client.spin_until(lambda: False, PERIOD_S)
+        graph.wait(PERIOD_S)
     assert len(graph.client.statuses) <= before + 1, "answers without colour"
     graph.logged("tracking_node", "no image pair", "the other stream has stopped")
     graph.track()

@@ -177,7 +177,7 @@ class FrameWorker:
             return True
         reason = f"the stamp {verdict.value} by {jump_s:.3f} s against the image pair before"
         if verdict is Verdict.JUMPS:
-            reason += "; it is believed when the next pair goes on from there"
+            reason += "; it is believed when the next pairs go on from there"
         self._refuse(pair, WRONG_STAMP, reason)
         return False
 

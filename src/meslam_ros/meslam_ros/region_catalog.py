@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from meslam_interfaces.msg import Region, RegionArray, RegionModel
 from meslam_ros.conversions import from_pose, stamp_ns, to_stamp
 
 MAX_SIDE_M = 1000.0
+MAX_MODEL_BYTES = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,11 @@ class RegionEntry:
         try:
             from_pose(model.pose)
         except FrameError as error:
-            raise MapError(f"region {region_index(model.index)}: {error}") from error
+            raise MapError(f"{model_name(model)}: {error}") from error
         if not (0.0 < sizes[0] <= MAX_SIDE_M and 0.0 <= sizes[1] < math.inf):
             raise MapError(
-                f"region {region_index(model.index)}: a box of {sizes[0]} m of which {sizes[1]} "
-                "m^3 were seen is none"
+                f"{model_name(model)}: a box of {sizes[0]} m of which {sizes[1]} m^3 were seen "
+                "is none"
             )
         return cls(
             index=region_index(model.index),
@@ -132,6 +134,29 @@ def region_index(values: Iterable[int]) -> RegionIndex:
     """A lattice index from a message's array."""
     x, y, z = (int(value) for value in values)
     return x, y, z
+
+
+def model_name(message: RegionModel) -> str:
+    """How a region model is called in messages to people."""
+    return f"region {list(map(int, message.index))} version {message.version}"
+
+
+def check_payload(message: RegionModel) -> None:
+    """Compare a model's data with what its header says of them, without decoding them.
+
+    Raises:
+        MapError: when they are of another format, too many, or damaged.
+    """
+    name = model_name(message)
+    if message.format != RegionModel.FORMAT:
+        raise MapError(
+            f"{name} has the format {message.format!r}, this program reads "
+            f"{RegionModel.FORMAT!r}; use the same MeSLAM on both computers"
+        )
+    if not 0 < len(message.data) <= MAX_MODEL_BYTES:
+        raise MapError(f"{name} has {len(message.data)} bytes, expected 1 to {MAX_MODEL_BYTES}")
+    if hashlib.sha256(message.data).hexdigest() != message.sha256:
+        raise MapError(f"{name}: the checksum does not match; it was damaged on its way")
 
 
 def _region(entry: RegionEntry) -> Region:

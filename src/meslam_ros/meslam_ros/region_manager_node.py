@@ -21,7 +21,7 @@ from meslam_ros.markers import region_markers
 from meslam_ros.node_settings import MapFrameSettings, RegionManagerSettings
 from meslam_ros.parameters import declare_config, declare_settings, read_config
 from meslam_ros.qos import MODELS_DEPTH, STREAM, latched
-from meslam_ros.region_catalog import RegionCatalog, RegionEntry, region_index
+from meslam_ros.region_catalog import RegionCatalog, RegionEntry, check_payload, region_index
 from meslam_ros.rgbd_input import STEADY
 
 
@@ -84,6 +84,7 @@ class RegionManagerNode(ManagedNode):
         if self._live_map_id not in ("", model.map_id) or not self._catalog.is_news(model):
             return
         try:
+            check_payload(model)
             entry = RegionEntry.of(model)
         except MapError as error:
             self._refused += 1

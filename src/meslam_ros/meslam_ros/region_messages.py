@@ -12,8 +12,8 @@ from meslam_core.map.codec import FORMAT, decode, encode
 from meslam_core.map.stored_region import StoredRegion
 from meslam_interfaces.msg import RegionModel
 from meslam_ros.conversions import byte_array, from_pose, stamp_ns, to_pose, to_stamp
+from meslam_ros.region_catalog import check_payload, model_name
 
-MAX_MODEL_BYTES = 64 << 20
 SAME_POSE = 1e-6
 
 
@@ -56,29 +56,15 @@ def _same_box(message: RegionModel, region: StoredRegion) -> bool:
     )
 
 
-def model_name(message: RegionModel) -> str:
-    """How a region model is called in messages to people."""
-    return f"region {list(map(int, message.index))} version {message.version}"
-
-
 def stored_region(message: RegionModel) -> StoredRegion:
     """The region of a message, after every check.
 
     Raises:
         MapError: when it is damaged, of another format, or contradicts its own header.
     """
+    check_payload(message)
     name = model_name(message)
-    if message.format != FORMAT:
-        raise MapError(
-            f"{name} has the format {message.format!r}, this program reads {FORMAT!r}; "
-            "use the same MeSLAM on both computers"
-        )
-    if not 0 < len(message.data) <= MAX_MODEL_BYTES:
-        raise MapError(f"{name} has {len(message.data)} bytes, expected 1 to {MAX_MODEL_BYTES}")
-    data = bytes(message.data)
-    if hashlib.sha256(data).hexdigest() != message.sha256:
-        raise MapError(f"{name}: the checksum does not match; it was damaged on its way")
-    region = decode(data, name)
+    region = decode(bytes(message.data), name)
     if region.index != tuple(message.index) or region.version != message.version:
         raise MapError(f"{name} holds {region.index} version {region.version} inside")
     if region.stamp_ns != stamp_ns(message.header.stamp):

@@ -39,7 +39,7 @@ from meslam_ros.processes import NodeProcess, ros_arguments  # noqa: E402
 RECORD = ROOT / "docs/reliability/sigkill_nodes.json"
 FRAMES = 20
 LONGEST_WAIT_S = 1.0
-STARTING_S = 180.0
+STARTING_S = 600.0
 SETTINGS = {
     "regions.volume_m3": 3.0,
     "keyframes.rays": 1024,

@@ -26,6 +26,7 @@ from fuzz.worker import fuzz_in_process  # noqa: E402
 RECORD = ROOT / "docs/reliability/fuzzing.json"
 FINDINGS = ROOT / "out/fuzz"
 LEAST_S = 0.1
+SUMMED = ("executions", "refused", "seconds", "elapsed_s", "findings")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,6 +97,31 @@ def _read(path: Path) -> dict[str, Any]:
 def _write(path: Path, record: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(record, indent=1) + "\n")
+    path.with_suffix(".txt").write_text("\n".join(table(record)) + "\n")
+
+
+def table(record: dict[str, Any]) -> list[str]:
+    """The record as lines for people; findings are kinds of errors, all of them before a fix."""
+    heads = ("target", "inputs", "refused", "CPU min", "min", "findings", "what")
+    rows = [heads]
+    for name, entry in record.items():
+        rows.append(_row(name, entry, entry["what"]))
+    total = {key: sum(entry[key] for entry in record.values()) for key in SUMMED}
+    rows.append(_row("all", total, ""))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if place in (0, len(heads) - 1) else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _row(name: str, entry: dict[str, Any], what: str) -> tuple[str, ...]:
+    minutes = (f"{entry[key] / 60.0:.1f}" for key in ("seconds", "elapsed_s"))
+    refused = f"{entry['refused'] / max(entry['executions'], 1):.0%}"
+    return (name, str(entry["executions"]), refused, *minutes, str(entry["findings"]), what)
 
 
 if __name__ == "__main__":

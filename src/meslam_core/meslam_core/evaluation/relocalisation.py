@@ -97,7 +97,7 @@ class Disturbed:
         self._recording = recording
         self._truth = truth
         mapped = slam.trajectory()
-        self._T_truth_map = _alignment(mapped, truth)
+        self._T_truth_map = map_alignment(mapped, truth)
         self._stamp_ns = int(mapped.stamps_ns[-1])
         self._period_ns = int(np.median(np.diff(mapped.stamps_ns)))
         self._last = self._true_pose(self._stamp_ns)
@@ -228,8 +228,13 @@ def dark(frame: RgbdFrame) -> RgbdFrame:
     return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
 
 
-def _alignment(mapped: Trajectory, truth: Trajectory) -> Pose:
-    """T_truth_map (4, 4) by positions and, where these span little, by directions."""
+def map_alignment(mapped: Trajectory, truth: Trajectory) -> Pose:
+    """T_truth_map (4, 4) by positions and, where these span little, by directions.
+
+    Args:
+        mapped: T_map_camera.
+        truth: T_truth_camera of some of the same instants.
+    """
     estimate, reference = associate(mapped, truth)
     return rigid_alignment(_around(estimate), _around(reference))
 

@@ -11,7 +11,8 @@ dense TSDF SLAM, and RGB-D odometry with a pose graph. `--dry-run` lists the cel
 Every cell has a process and a folder of its own in benchmarks/.cache/evaluation, so that an
 interruption loses one cell; finished ones are not repeated, unless `--again METHOD` says so. evo
 and our own evaluation must agree to a micrometre in every cell, or all stops. Writes
-docs/benchmarks/evaluation.json, or evaluation_quick.json, and docs/evaluation.md out of both.
+docs/benchmarks/evaluation.json, or evaluation_quick.json, docs/evaluation.md out of both, and the
+page of `meslam report` about our runs beside the cells.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from peers.__main__ import PEERS
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from simulated import program
 from slam_run import HERE, SlamRun
 
 from meslam_core.config import PRESETS
@@ -58,6 +60,8 @@ USUAL = {
     "pose_graph": (8.0, 9.0),
 }
 SIMULATED_FRAMES_S = 3.0
+# Of each run in the report.
+VIEWS = 2
 
 
 @dataclass(frozen=True)
@@ -216,6 +220,15 @@ def write_results(cells: list[Cell], failures: Failures, options: argparse.Names
     write_document(options.out, options.document)
 
 
+def write_page(cells: list[Cell], target: Path) -> None:
+    """The report of our runs with the default settings and the first seed, side by side."""
+    runs = [cell.job for cell in cells if cell.result and cell.job.method == "meslam"]
+    folders = [str(job.out) for job in runs if job.seed == 0]
+    if folders:
+        command = [program(), "report", *folders, "--out", str(target)]
+        subprocess.run([*command, "--views", str(VIEWS)], check=True)
+
+
 def parsed_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="ten minutes: few frames, one seed")
@@ -229,6 +242,7 @@ def parsed_options() -> argparse.Namespace:
     parser.add_argument("--cores", type=int, default=2, help="that every run may use")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of JSON and plots")
     parser.add_argument("--document", type=Path, default=RESULTS.parent / "evaluation.md")
+    parser.add_argument("--page", type=Path, help="the report of our runs; HTML")
     parser.add_argument("--note", default="", help="remark for the results")
     options = parser.parse_args()
     quick = options.quick
@@ -237,6 +251,8 @@ def parsed_options() -> argparse.Namespace:
     options.frames = options.frames or (QUICK_FRAMES if quick else ":")
     usual = QUICK_BASELINE_FRAMES if quick else BASELINE_FRAMES
     options.baseline_frames = options.baseline_frames or usual
+    page = CACHE / ("report_quick.html" if quick else "report.html")
+    options.page = options.page or page
     return options
 
 
@@ -254,6 +270,7 @@ def main() -> None:
     failures = run_all(cells, console)
     write_results(cells, failures, options)
     console.print(f"results in {options.document}")
+    write_page(cells, options.page)
     if failures:
         sys.exit(f"{len(failures)} cells failed; the same command tries them again")
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from argparse import Namespace
 from pathlib import Path
 
 import evaluation
 import evaluation_cell
+import machine
 import numpy as np
 import pytest
 from data.image_folders import write_image, write_tum
@@ -165,6 +167,41 @@ def test_a_cell_in_which_evo_disagrees_is_not_done(cell_of, monkeypatch, tmp_pat
     assert not list(tmp_path.glob(f"cells/**/{CELL}"))
 
 
+def test_what_others_compute_is_told(data, monkeypatch, tmp_path):
+    """The machine was busy for a second, and the run itself slept."""
+    job = evaluation.SlamRun(desk(data), "tsdf", 0, ":", 1, tmp_path / "cell")
+    command = [sys.executable, "-c", "import time; print('hello'); time.sleep(0.2)"]
+    monkeypatch.setattr(evaluation.SlamRun, "command", command)
+    busy_s = iter((10.0, 11.0))
+    monkeypatch.setattr(evaluation_cell, "busy_core_s", lambda: next(busy_s))
+    started = time.perf_counter()
+    told = evaluation_cell.run_and_watch(job)
+    longest_s = time.perf_counter() - started
+    assert 0.8 / longest_s < told["others_cores"] < 1.0 / 0.2
+    assert told["load_average"] >= 0.0
+    assert "hello" in (tmp_path / f"cell.{evaluation_cell.LOG}").read_text()
+
+
+def test_the_machine_has_computed_something():
+    assert machine.busy_core_s() > 0.0
+
+
+def test_the_page_is_of_our_first_seeds(data, monkeypatch, tmp_path):
+    asked: list[list[str]] = []
+    monkeypatch.setattr(evaluation.subprocess, "run", lambda command, **_: asked.append(command))
+    options = Namespace(
+        seeds=2, methods=["meslam", "tsdf"], frames=":", baseline_frames=":", cores=1
+    )
+    monkeypatch.setattr(evaluation, "CACHE", tmp_path / "cells")
+    cells = evaluation.cells_of([Source(desk(data), "a desk")], options)
+    for cell in cells:
+        cell.path.parent.mkdir(parents=True)
+        cell.path.write_text("{}")
+    evaluation.write_page(cells, tmp_path / "page.html")
+    assert asked[0][1:3] == ["report", str(cells[0].job.out)]
+    assert not any("tsdf" in word or "meslam_1" in word for word in asked[0][1:])
+
+
 class ScriptedCell(evaluation.Cell):
     """A cell whose work is a line of Python."""
 
@@ -237,8 +274,8 @@ def fabricated(recording: str, method: str, ate_m: float, **others: object) -> d
 
 
 def document(folder: Path, stem: str, cells: list[dict[str, object]]) -> str:
-    machine = {"cpu": "abacus", "cores": 2, "instruction_sets": [], "versions": {}}
-    result = {"command": "make benchmark", "arguments": "", "machine": machine, "note": ""}
+    abacus = {"cpu": "abacus", "cores": 2, "instruction_sets": [], "versions": {}}
+    result = {"command": "make benchmark", "arguments": "", "machine": abacus, "note": ""}
     result |= {"cells": cells, "failures": {"room, tsdf, seed 1": "no memory is left"}}
     (folder / "benchmarks").mkdir(exist_ok=True)
     (folder / "benchmarks" / f"{stem}.json").write_text(json.dumps(result))

@@ -105,7 +105,7 @@ def browser(environment: Mapping[str, str], there: bool) -> Finding:
     return ok(
         "browser",
         f"{missing} here; open the page of `meslam view` from another computer: "
-        "`ssh -L PORT:localhost:PORT THIS_COMPUTER`, then http://localhost:PORT there",
+        "`ssh -L 8080:localhost:8080 THIS_COMPUTER`, then http://localhost:8080 there",
     )
 
 

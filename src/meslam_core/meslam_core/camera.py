@@ -94,7 +94,7 @@ class PinholeCamera:
         if depth_m.shape != (self.height, self.width):
             raise FrameError(
                 f"depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, "
-                f"the camera {self.width}x{self.height}"
+                f"the camera {self.width}x{self.height}; use the intrinsics of these images"
             )
         return self.pixel_directions() * depth_m[..., None].astype(np.float32)
 

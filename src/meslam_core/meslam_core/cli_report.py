@@ -56,14 +56,15 @@ def report(
     """
     truths = _one_each("--truth", truth, len(runs))
     recordings = _one_each("--recording", recording, len(runs))
-    from meslam_core.console import counting_bar, error_console
+    from meslam_core.console import counting_bar, error_console, waiting
     from meslam_core.report import read_run, write_report
 
     target = out or (runs[0] / PAGE if len(runs) == 1 else Path(PAGE))
     read: list[RunFolder] = []
     try:
-        for run, poses, source in zip(runs, truths, recordings, strict=True):
-            read.append(read_run(run, poses, source, lever_arm))
+        with waiting("reading what the runs left"):
+            for run, poses, source in zip(runs, truths, recordings, strict=True):
+                read.append(read_run(run, poses, source, lever_arm))
         with counting_bar(error_console(), "views") as progress:
             write_report(read, target, views, progress)
     finally:

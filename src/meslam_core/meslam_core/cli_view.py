@@ -41,6 +41,7 @@ def view(
     The map, its regions, the path, the camera and what it saw, at any time of the run. For a
     running system there is `viewer_node`. Ctrl-C ends it.
     """
+    from meslam_core.console import waiting
     from meslam_core.viewer.finished_run import FinishedRun
     from meslam_core.viewer.scene import ViewControls
     from meslam_core.viewer.viewer import Viewer
@@ -49,7 +50,8 @@ def view(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     with Viewer(host, port, ViewControls(mesh_resolution_m=resolution), eager=True) as viewer:
-        run = FinishedRun(viewer, path, recording)
+        with waiting("reading what the run left"):
+            run = FinishedRun(viewer, path, recording)
         try:
             for line in run.missing:
                 complain(line)

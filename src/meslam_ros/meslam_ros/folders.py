@@ -50,4 +50,6 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"the folder {path} cannot be made: {error.strerror}") from error
+        raise OutputError(
+            f"the folder {path} cannot be made: {error.strerror}; choose one that can"
+        ) from error

@@ -35,7 +35,7 @@ class FrameReader:
     def __init__(self, recording: Recording, start_s: float, step: int, limit: int) -> None:
         stamps_ns = recording.stamps_ns
         if len(stamps_ns) == 0:
-            raise RecordingError(f"{recording.path} holds no image pair")
+            raise RecordingError(f"{recording.path} holds no image pair; record it again")
         start_ns = int(stamps_ns[0]) + round(start_s * NANOSECONDS)
         numbers = [n for n in range(0, len(stamps_ns), step) if stamps_ns[n] >= start_ns]
         numbers = numbers[: limit or None]

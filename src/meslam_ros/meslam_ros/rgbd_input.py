@@ -147,7 +147,8 @@ class RgbdInput:
         if color.shape[:2] != (camera.height, camera.width):
             raise FrameError(
                 f"{self._color.topic} has {color.shape[1]}x{color.shape[0]} images, its "
-                f"camera_info says {camera.width}x{camera.height}"
+                f"camera_info says {camera.width}x{camera.height}; publish the one that belongs to "
+                "these images"
             )
         if self._is_registered(pair, depth_m.shape, camera):
             depth_m = color_info.lens.undistort_depth(depth_m)
@@ -209,7 +210,8 @@ class RgbdInput:
         if depth_m.shape != (depth_info.camera.height, depth_info.camera.width):
             raise FrameError(
                 f"{self._depth.topic} has {depth_m.shape[1]}x{depth_m.shape[0]} images, its "
-                f"camera_info says {depth_info.camera.width}x{depth_info.camera.height}"
+                f"camera_info says {depth_info.camera.width}x{depth_info.camera.height}; publish "
+                "the one that belongs to these images"
             )
         return register_depth_to_color(
             depth_info.lens.undistort_depth(depth_m),

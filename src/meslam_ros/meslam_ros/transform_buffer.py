@@ -122,7 +122,9 @@ class TransformBuffer:
                 return se3.inverse(target_chain[frame]) @ T_frame_origin
         parents = {edge.parent for edge in self._edges.values()}
         known = ", ".join(sorted(parents | set(self._edges))) or "nothing"
-        raise FrameError(f"TF does not connect {origin!r} to {target!r}; it knows {known}")
+        raise FrameError(
+            f"TF does not connect {origin!r} to {target!r}; it knows {known}. Publish what is missing"
+        )
 
     def _chain(self, frame: str, stamp: int) -> Iterator[tuple[str, se3.Pose]]:
         """A frame and everything above it, with T_above_frame; ends where a time is unknown.

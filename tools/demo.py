@@ -55,6 +55,8 @@ SCENE, SEED, DURATION_S = "room", 1, 20.0
 NODES_LOG, PLAYER_LOG = "nodes.log", "player.log"
 STARTING_S, FINISHING_S, SERVICE_S, SILENCE_S = 90.0, 120.0, 300.0, 120.0
 IMAGE_SUBSCRIBERS = 2
+# So that who watches sees something new every second.
+MODEL_PERIOD_S = 0.9
 LOG_LINES = 15
 
 
@@ -134,11 +136,18 @@ def run(console: Console, path: Path, out: Path, truth_file: Path | None, frames
         task = progress.add_task("writing the report", total=None)
         write_page(out, lambda done, total: progress.update(task, completed=done, total=total))
     summarise(console, path, out, report)
+    console.print(
+        f"see it again in the browser: meslam view {out}", highlight=False, soft_wrap=True
+    )
 
 
 def map_live(console: Console, path: Path, count: int, staging: Path) -> Live:
     """Start the nodes, play the recording, ask for the map."""
-    folders = {"export_folder": staging, "map_folder": staging}
+    given = {
+        "export_folder": staging,
+        "map_folder": staging,
+        "model_period_s": MODEL_PERIOD_S,
+    }
     playing = {
         "recording": path,
         "rate": 0.0,
@@ -147,7 +156,7 @@ def map_live(console: Console, path: Path, count: int, staging: Path) -> Live:
     }
     with (
         MeslamClient("meslam_demo") as client,
-        _node("slam_node", ros_arguments(folders), staging / NODES_LOG) as slam,
+        _node("slam_node", ros_arguments(given), staging / NODES_LOG) as slam,
     ):
         with console.status("starting the nodes"):
             _wait(client, slam, lambda: _all_there(client), STARTING_S, "the nodes do not start")

@@ -123,8 +123,8 @@ class TransformBuffer:
         parents = {edge.parent for edge in self._edges.values()}
         known = ", ".join(sorted(parents | set(self._edges))) or "nothing"
         raise FrameError(
-            f"TF does not connect {origin!r} to {target!r}; it knows {known}. Publish the transform "
-            "that is missing"
+            f"TF does not connect {origin!r} to {target!r}; it knows {known}. Publish the "
+            "transform that is missing"
         )
 
     def _chain(self, frame: str, stamp: int) -> Iterator[tuple[str, se3.Pose]]:

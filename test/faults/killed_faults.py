@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 import signal
 import subprocess
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from faults import material
-from faults.bench import MESLAM, Bench, wait_for
+from faults.bench import Bench, wait_for
 from faults.earlier_run import (
     SLOW,
     again,
@@ -25,7 +28,10 @@ from faults.expectations import (
 from faults.fault import Group, Seen, faults_of
 from faults.material import QUICK
 
-KILLED_SAVES = 12
+if TYPE_CHECKING:
+    from meslam_core.map.stored_region import StoredRegion
+
+FEWEST_STEPS = 5
 
 KILLED_RUNS = 5
 
@@ -52,40 +58,35 @@ def _killed_runs(bench: Bench, out: Path) -> Seen:
 
 
 def _killed_saves(bench: Bench) -> Seen:
-    """A process that saves two maps in turn is killed; one of them is there, whole."""
+    """A save is killed before its first change of the disk, before its second one, and so on."""
+    import pytest
+    from data.killed_process import killed_at_call
     from faults.kept_maps import lost_maps
 
+    from meslam_core.map.store import MapStore
+
     stored = bench.copy(material.stored_map(bench))
-    generator = random.Random(7)
+    loaded = MapStore(stored).load()
+    first = loaded.regions[0]
     lost = []
-    saving = (
-        "import sys, itertools; from pathlib import Path\n"
-        "from meslam_core.map.store import MapStore\n"
-        "from dataclasses import replace\n"
-        "store = MapStore(sys.argv[1]); loaded = store.load(); first = loaded.regions[0]\n"
-        "print('saving', flush=True)\n"
-        "for version in itertools.count(first.version + 1):\n"
-        "    store.save([replace(first, version=version)], loaded.grid)\n"
-    )
-    for _ in range(KILLED_SAVES):
-        process = subprocess.Popen(
-            [MESLAM[0], "-c", saving, str(stored)], stdout=subprocess.PIPE, text=True
-        )
-        try:
-            assert process.stdout is not None
-            process.stdout.readline()
-            time.sleep(generator.uniform(0.0, 0.2))
-        finally:
-            process.kill()
-            process.communicate()
+    for step in itertools.count(1):
+        newer = replace(first, version=first.version + step)
+
+        def save(newer: StoredRegion = newer) -> None:
+            MapStore(stored).save([newer], loaded.grid)
+
+        status = killed_at_call(step, save, pytest.MonkeyPatch())
         lost += lost_maps(bench.folder)
-    return Seen(f"{KILLED_SAVES} saves killed, {len(lost)} maps lost", {"lost": lost})
+        if status == 0:
+            break
+    words = f"killed at {step - 1} steps, {len(lost)} maps lost"
+    return Seen(words, {"lost": lost, "killed": step > FEWEST_STEPS})
 
 
 def _none_lost(seen: Seen) -> str:
     if seen.facts["lost"]:
         return str(seen.facts["lost"][0])
-    return "" if seen.facts.get("killed", 1) else "no run was killed in time"
+    return "" if seen.facts.get("killed", 1) else "nothing was killed in the middle"
 
 
 def _interrupted(number: signal.Signals, times: int = 1) -> Callable[[Bench], Seen]:
@@ -136,7 +137,7 @@ _fault = faults_of(Group.STORAGE)
 KILLED = (
     _fault(
         "killed-while-saving",
-        f"{KILLED_SAVES} SIGKILLs at random instants of a save",
+        "SIGKILL before every step of a save that changes the disk, one after the other",
         "every time the map loads",
         _killed_saves,
         _none_lost,

@@ -175,6 +175,16 @@ def test_without_a_map_and_a_path_the_rest_is_shown(make_run):
     assert "<svg" in section(page, "tracking")
 
 
+def test_a_damaged_region_is_named(make_run):
+    folder = make_run()
+    file = next((folder / "map.meslam").glob("region_*"))
+    file.write_bytes(file.read_bytes()[:-100])
+    run = read_run(folder)
+    run.close()
+    assert run.map is None
+    assert any("region (0, 0, 0)" in sentence for sentence in run.missing)
+
+
 def test_another_recording_is_noticed(make_run, tmp_path):
     folder = make_run()
     lines = (folder / "trajectory.txt").read_text().splitlines()

@@ -22,7 +22,7 @@ INK, GRID = "#010203", "#020304"
 _THEME = {INK: "currentColor", GRID: "var(--line)"}
 
 # Okabe and Ito, *Color universal design*, 2008, in an order of distinct lightness.
-RUN_COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c8c8c")
+RUN_COLORS = ("#1a80c4", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c8c8c")
 STAGE_COLORS = {
     "reading": "#8c8c8c",
     "odometry": "#e69f00",

@@ -16,7 +16,6 @@ from meslam_core.evaluation.plots import ground_axes
 from meslam_core.evaluation.trajectory_error import AbsoluteError
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.report.figure_style import (
-    GRID,
     INK,
     MOST_POINTS,
     NARROW,
@@ -47,9 +46,6 @@ def path_figure(run: RunFolder, number: int) -> Figure:
     estimate = run.refined if run.error is None else run.error.estimate
     truth = None if run.error is None else run.error.truth
     across, up = ground_axes(estimate if truth is None else truth)
-    if run.map is not None:
-        T_shown_map = np.eye(4) if run.error is None else run.error.mounting.T_truth_map
-        _draw_boxes(above, run.map, T_shown_map, across, up)
     if truth is not None:
         _draw_above(above, truth, across, up, color=TRUTH_COLOR, linewidth=4.0, label="truth")
     if run.error is None:
@@ -59,6 +55,9 @@ def path_figure(run: RunFolder, number: int) -> Figure:
     start = estimate.positions[0]
     above.plot(start[across], start[up], "o", color=INK, markersize=6, label="start")
     _frame_path(above, estimate if truth is None else truth, across, up)
+    if run.map is not None:
+        T_shown_map = np.eye(4) if run.error is None else run.error.mounting.T_truth_map
+        _draw_boxes(above, run.map, T_shown_map, across, up)
     above.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]")
     above.legend(loc="best")
     vertical = 3 - across - up
@@ -74,10 +73,11 @@ def path_figure(run: RunFolder, number: int) -> Figure:
 @drawn("Position error over the length of the path")
 def error_figure(runs: Sequence[tuple[int, RunFolder]]) -> Figure:
     """Position errors of runs with a truth, by their numbers in the report."""
-    figure = Figure(figsize=(WIDE, 3.4), layout="constrained")
+    size = (NARROW, 4.0) if len(runs) == 1 else (WIDE, 3.4)
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     for number, run in runs:
-        for error, name, alpha in ((run.error, "refined", 1.0), (run.online_error, "online", 0.45)):
+        for error, name, alpha in ((run.error, "refined", 1.0), (run.online_error, "online", 0.6)):
             assert error is not None
             walked = np.linalg.norm(np.diff(error.truth.positions, axis=0), axis=1).cumsum()
             x, middle, _, high = thinned(np.append(0.0, walked), 100.0 * error.errors_m)
@@ -94,7 +94,7 @@ def error_figure(runs: Sequence[tuple[int, RunFolder]]) -> Figure:
     axes.set(xlabel="length of the true path [m]", ylabel="position error [cm]")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
-    axes.legend(loc="upper left", ncols=2)
+    axes.legend(loc="upper left", ncols=min(len(runs), 3))
     return figure
 
 
@@ -146,11 +146,23 @@ def _draw_boxes(
         corners = np.zeros((4, 4))
         corners[:, :2], corners[:, 3] = square * region.stored.half_side_m, 1.0
         shown = corners @ (T_shown_map @ region.stored.T_map_region).T
-        outlines.append(shown[:, [across, up]])
-    boxes = PolyCollection(
-        outlines, facecolors="none", edgecolors=GRID, linestyles="--", label="regions' boxes"
-    )
-    axes.add_collection(boxes, autolim=False)
+        outline = shown[:, [across, up]]
+        if _is_seen(axes, outline):
+            outlines.append(outline)
+    if outlines:
+        boxes = PolyCollection(
+            outlines, facecolors="none", edgecolors=INK, linestyles="--", linewidths=0.7
+        )
+        boxes.set_label("regions' boxes")
+        axes.add_collection(boxes, autolim=False)
+
+
+def _is_seen(axes: Axes, outline: Floats) -> bool:
+    """Whether the edge of a box (N, 2) passes through what the axes show."""
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    box_low, box_high = outline.min(axis=0), outline.max(axis=0)
+    around = (box_low <= low).all() and (high <= box_high).all()
+    return bool((box_low < high).all() and (low < box_high).all() and not around)
 
 
 def _frame_path(axes: Axes, path: Trajectory, across: int, up: int) -> None:

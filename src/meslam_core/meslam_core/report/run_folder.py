@@ -15,6 +15,7 @@ from meslam_core.evaluation.report import truth_entries
 from meslam_core.evaluation.trajectory_error import AbsoluteError, absolute_error
 from meslam_core.frame_log import FRAMES, FrameTable, read_frame_log
 from meslam_core.map.neural_map import NeuralMap
+from meslam_core.map.reader import read_map
 from meslam_core.recordings import open_recording
 from meslam_core.recordings.recording import Recording
 from meslam_core.results import MAP, ONLINE_TRAJECTORY, REPORT, TRAJECTORY
@@ -157,7 +158,9 @@ def _compare(run: RunFolder, given: Path | None, lever_arm: bool) -> None:
 
 def _open_map(run: RunFolder) -> None:
     try:
-        run.map = NeuralMap.load(run.path / MAP)
+        stored = read_map(run.path / MAP)
+        run.missing += [f"Part of the map: {warning}." for warning in stored.warnings]
+        run.map = NeuralMap(stored.regions)
     except MapError as error:
         run.missing.append(f"Views of the map: {error}.")
 

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from meslam_core.frame_log import FrameTable
@@ -79,7 +80,10 @@ def growth_figure(runs: Numbered) -> Figure:
     axes = _stack(figure, len(known), [1.0] * len(known))
     for below, (name, label, scale) in zip(axes, known, strict=True):
         _draw_column(below, runs, name, label, scale)
+        if name == "map_bytes":
+            _draw_stored(below, runs, scale)
         below.set_ylim(bottom=0)
+        below.yaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
     _finish(figure, axes, runs)
     return figure
 
@@ -154,6 +158,22 @@ def _draw_column(axes: Axes, runs: Numbered, name: str, label: str, scale: float
         seconds = run_seconds(run, table.stamps_ns)
         _draw_curve(axes, number, seconds, scale * table.numbers[name])
     axes.set_ylabel(label)
+
+
+def _draw_stored(axes: Axes, runs: Numbered, scale: float) -> None:
+    """A dot at the end for the map as it was stored after the last refinement."""
+    for number, run in runs:
+        stored = run.entries.get("map_bytes")
+        if isinstance(stored, int):
+            seconds = run_seconds(run, _frames(run).stamps_ns)
+            axes.plot(
+                seconds[-1],
+                scale * stored,
+                "o",
+                color=run_color(number),
+                clip_on=False,
+                markersize=5,
+            )
 
 
 def _draw_errors(axes: Axes, runs: Numbered) -> None:

@@ -80,8 +80,7 @@ def main() -> int:
     try:
         recording = options.recording or simulated(console)
         _own_domain()
-        with live_page(console, options.port):
-            run(console, recording, options.out, options.truth, options.frames)
+        run(console, recording, options.out, options.truth, options.frames, options.port)
     except TrackingLostError as error:
         console.print(f"[bold red]demo failed:[/] {error}", highlight=False)
         return 3
@@ -110,14 +109,16 @@ def simulated(console: Console) -> Path:
     return path
 
 
-def run(console: Console, path: Path, out: Path, truth_file: Path | None, frames: int) -> None:
+def run(
+    console: Console, path: Path, out: Path, truth_file: Path | None, frames: int, port: int
+) -> None:
     """Map one recording with the nodes and leave the results in `out`."""
     started = time.monotonic()
     recording = open_recording(path)
     count = min(frames or len(recording), len(recording))
     truth_file = find_truth(path, truth_file)
     truth = None if truth_file is None else read_tum(truth_file)
-    with ResultFolder(out) as results:
+    with ResultFolder(out) as results, live_page(console, port):
         staging = results.incomplete("")
         live = map_live(console, path.resolve(), count, staging)
         with console.status("evaluating"):

@@ -84,6 +84,7 @@ def test_people_get_pictures_and_a_summary(desk: tuple[Path, str]) -> None:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     assert "frames with a pose" in output
     assert "ATE RMSE" in output
+    assert "live in the browser: http://127.0.0.1:" in output.replace("\n", "")
     page = (out / "report.html").read_text()
     for part in ("path", "map", "tracking", "time", "growth"):
         assert f'<section id="{part}">' in page

@@ -15,13 +15,14 @@ import cv2
 import numpy as np
 from data.bag_builder import BagBuilder, Storage, aligned_bag
 from data.image_folders import write_folder, write_tum
+from data.memory_recording import MemoryRecording
 from data.synthetic_frames import CAMERA, START_NS, depth_mm, plane_frame, plane_frames
 from fuzz.mutation import Parts, mutated_bytes, mutated_parts
 from fuzz.target import Target
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 
-from meslam_core.recordings import describe, open_recording
+from meslam_core.recordings import convert, describe, open_recording
 from meslam_core.recordings.images import decode_color, decode_depth
 
 FRAMES = 3
@@ -131,7 +132,15 @@ def _without_files(parts: Parts, others: list[Parts], rng: Random) -> Parts:
 def _bag_seeds(storage: Storage) -> list[Parts]:
     with tempfile.TemporaryDirectory() as folder:
         path = aligned_bag(plane_frames(FRAMES), Path(folder), storage)
-        return [files_below(path) if path.is_dir() else {path.name: path.read_bytes()}]
+        if path.is_dir():
+            return [files_below(path)]
+        seeds = [{path.name: path.read_bytes()}]
+        if storage == "mcap":
+            # As `meslam convert` writes it: compressed, with checksums.
+            path.unlink()
+            convert(MemoryRecording(plane_frames(FRAMES)), path)
+            seeds.append({path.name: path.read_bytes()})
+        return seeds
 
 
 def _bag_file(parts: Parts, folder: Path) -> str:

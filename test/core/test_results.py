@@ -80,7 +80,7 @@ def test_other_files_in_the_folder_are_left_alone(tmp_path):
 
 def test_a_place_that_cannot_be_written_is_known_at_once(tmp_path):
     (tmp_path / "file").write_text("")
-    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+    for place in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / ("long" * 100)):
         with pytest.raises(OutputError, match="cannot be written"), ResultFolder(place):
             pass
 

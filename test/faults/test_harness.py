@@ -8,13 +8,16 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from faults import table
+import typer
+from faults import catalogue, table
+from faults.__main__ import main
 from faults.bench import wait_for
 from faults.catalogue import every_fault
 from faults.fault import Fault, Group, Seen
 from faults.injection import Result, Verdict
 from faults.runner import Trial
 from faults.spoilt_harness import FAULTS
+from typer.testing import CliRunner
 
 SPOILT = {fault.name: fault for fault in FAULTS}
 QUICK = [fault for fault in every_fault() if fault.quick]
@@ -47,8 +50,31 @@ def test_the_harness_notices(name: str, verdict: Verdict, words: str, tmp_path: 
     wait_for(lambda: not _processes_in(tmp_path), "the end of all that a fault started")
 
 
+def test_a_run_goes_on_where_it_was_and_fails_on_a_miss(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalogue, "modules", lambda: ["faults.spoilt_harness"])
+
+    def run(*names: str) -> int:
+        app = typer.Typer()
+        app.command()(main)
+        return CliRunner().invoke(app, [*names, "--out", str(tmp_path)]).exit_code
+
+    assert run("fine", "skip") == 0
+    (first,) = tmp_path.glob("*/fine/result.json")
+    before = first.stat().st_mtime_ns
+    assert run("fine", "miss") == 1
+    assert first.stat().st_mtime_ns == before
+    page = (tmp_path / "reliability.md").read_text()
+    assert "2 faults: 1 as expected, 1 missed." in page
+    assert run("fine", "--fresh") == 0
+    assert first.stat().st_mtime_ns != before
+    assert run("moon") == 2
+
+
 def test_every_fault_is_well_formed() -> None:
     faults = every_fault()
+    assert len(faults) >= 60
     assert len(faults) == len({fault.name for fault in faults})
     groups = Counter(fault.group for fault in faults)
     assert set(groups) <= set(Group)

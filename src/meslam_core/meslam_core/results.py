@@ -49,8 +49,8 @@ class ResultFolder:
         self._created: list[Path] = []
 
     def __enter__(self) -> ResultFolder:
-        self._check_earlier_map()
         try:
+            self._check_earlier_map()
             for folder in (*reversed(self.path.parents), self.path):
                 if not folder.is_dir():
                     folder.mkdir()

@@ -83,6 +83,29 @@ def test_a_known_instant_within_a_gap_needs_no_interpolation():
     assert at(given(trajectory([0, 5, 10])), 5).valid
 
 
+@pytest.mark.parametrize("jump", [[10.0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 2.0]])
+def test_a_jump_is_told_and_left_out(jump):
+    steady = trajectory([0, 1, 2, 3, 4])
+    poses = steady.poses.copy()
+    poses[2:] = exp(np.array(jump)) @ poses[2:]
+    odometry = given(Trajectory(steady.stamps_ns, poses))
+    estimates = [at(odometry, number) for number in range(5)]
+    assert [estimate.valid for estimate in estimates] == [True, True, False, True, True]
+    assert "the given poses jump by" in estimates[2].reason
+    for before, after in ((0, 1), (2, 3), (3, 4)):
+        motion = inverse(estimates[before].T_odom_camera) @ estimates[after].T_odom_camera
+        np.testing.assert_allclose(log(motion), STEP, atol=1e-9)
+    # The camera is where it was: what came with the jump is unknown.
+    still = inverse(estimates[1].T_odom_camera) @ estimates[2].T_odom_camera
+    np.testing.assert_allclose(still, np.eye(4), atol=1e-9)
+
+
+def test_a_fast_camera_does_not_jump():
+    poses = np.array([exp(number * np.array([0.25, 0, 0, 0, 0, 0.4])) for number in range(4)])
+    odometry = given(Trajectory(np.arange(4) * PERIOD_NS, poses))
+    assert all(at(odometry, number).valid for number in range(4))
+
+
 def test_uncertainty_grows_with_the_way_as_wheels_do():
     noise = given_noise(
         MeslamConfig.from_overrides(

@@ -8,17 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from data.ros_camera import CameraDriver, Messages
+from data.ros_camera import BASE_FRAME, CameraDriver, Messages
 from data.textured_room import PERIOD_NS, frame_at, path
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 
+from meslam_core.camera import T_BODY_OPTICAL
 from meslam_core.frame import RgbdFrame
+from meslam_core.se3 import inverse
 from meslam_interfaces.msg import RegionModel, TrackingStatus
 from meslam_interfaces.srv import ListRegions
 from meslam_ros import topics
 from meslam_ros.client import MeslamClient
-from meslam_ros.conversions import NANOSECONDS
+from meslam_ros.conversions import NANOSECONDS, to_pose, to_stamp
 from meslam_ros.processes import NodeProcess, ros_arguments
 from meslam_ros.qos import STREAM, latched
 
@@ -114,6 +117,15 @@ class LiveGraph:
         """Stamp of the next view [ns]."""
         return self.stamp_ns + PERIOD_NS
 
+    def odometry(self) -> Odometry:
+        """True odometry of the next view."""
+        moved = inverse(POSES[0]) @ POSES[(self._place + 1) % len(POSES)]
+        message = Odometry(child_frame_id=BASE_FRAME)
+        message.header.frame_id = "odom"
+        message.header.stamp = to_stamp(self.next_ns)
+        message.pose.pose = to_pose(T_BODY_OPTICAL @ moved @ inverse(T_BODY_OPTICAL))
+        return message
+
     def wait(self, seconds: float) -> None:
         """Listen for a while [s]."""
         self.client.spin_until(lambda: False, seconds)
@@ -154,11 +166,19 @@ class LiveGraph:
             f"not tracked well again: state {status.state}, {status.reason!r}\n{self.logs()}"
         )
 
-    def served(self) -> dict[tuple[int, ...], int]:
+    def served(self, timeout_s: float = ANSWER_S) -> dict[tuple[int, ...], int]:
         """The map server's regions and their versions."""
-        regions = self.client.call(ListRegions, topics.LIST_REGIONS).regions
+        answer = self.client.call(ListRegions, topics.LIST_REGIONS, timeout_s=timeout_s)
+        regions = answer.regions
         self.map_id = regions.map_id
         return {tuple(region.index): region.version for region in regions.regions}
+
+    def tries_served(self) -> dict[tuple[int, ...], int]:
+        """`served`, of a map server that may not be there yet."""
+        try:
+            return self.served(timeout_s=5.0)
+        except TimeoutError:
+            return {}
 
     def settle(self) -> str:
         """Wait until the map is refined, published and served; its identity."""

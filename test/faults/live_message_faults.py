@@ -20,7 +20,7 @@ from tf2_msgs.msg import TFMessage
 
 from meslam_interfaces.msg import RegionModel, TrackingStatus
 from meslam_ros import topics
-from meslam_ros.conversions import byte_array, to_stamp
+from meslam_ros.conversions import byte_array
 from meslam_ros.region_messages import region_model, stored_region
 
 MAP_SIDE = ("map_server_node", "region_manager_node", "tracking_node")
@@ -116,10 +116,7 @@ def wrong_odometry(change: Callable[[Odometry], None], *words: str) -> Disturban
         with graph.foreign(Odometry, topics.ODOMETRY) as wheels:
 
             def drive(wrong: bool = False) -> TrackingStatus:
-                message = Odometry(child_frame_id=BASE_FRAME)
-                message.header.frame_id = "odom"
-                message.header.stamp = to_stamp(graph.next_ns)
-                message.pose.pose.orientation.w = 1.0
+                message = graph.odometry()
                 if wrong:
                     change(message)
                 wheels.publish(message)
@@ -159,15 +156,12 @@ def out_of_this_world(message: Odometry) -> None:
 def scaled_quaternions(graph: LiveGraph) -> str:
     """A driver that does not normalise: the rotation is right all the same."""
 
-    def scaled(message: Odometry) -> None:
-        message.pose.pose.orientation.w = 7.0
-
     with graph.foreign(Odometry, topics.ODOMETRY) as wheels:
         for _ in range(COUNT):
-            message = Odometry(child_frame_id=BASE_FRAME)
-            message.header.stamp = to_stamp(graph.next_ns)
-            message.header.frame_id = "odom"
-            scaled(message)
+            message = graph.odometry()
+            rotation = message.pose.pose.orientation
+            for axis in "xyzw":
+                setattr(rotation, axis, 7.0 * getattr(rotation, axis))
             wheels.publish(message)
             status = graph.track()
     assert status.odometry_valid, "the odometry was not used"

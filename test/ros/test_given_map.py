@@ -174,6 +174,8 @@ def damaged(asked: UseMap.Request, how: str) -> UseMap.Request:
         asked.lattice_side_m = -1.0
     elif how == "overlap":
         asked.overlap = float("nan")
+    elif how == "twice":
+        asked.regions = [*asked.regions, *asked.regions]
     elif how == "networks":
         region = stored_region(asked.regions[0])
         other = replace(
@@ -195,6 +197,7 @@ CASES = {
     "identity": (Code.INVALID_DATA, "is of the map"),
     "lattice": (Code.INVALID_DATA, "lattice"),
     "overlap": (Code.INVALID_DATA, "lattice"),
+    "twice": (Code.INVALID_DATA, "2 regions have 1 places"),
     "networks": (Code.INVALID_DATA, "different networks or masks"),
 }
 

@@ -52,6 +52,9 @@ class GivenMap:
             if model.map_id != request.map_id:
                 raise MapError(f"{model_name(model)} is of the map {model.map_id!r}, not of this")
             regions.append((stored_region(model), bytes(model.data)))
+        places = {region.index for region, _ in regions}
+        if len(places) < len(regions):
+            raise MapError(f"{len(regions)} regions have {len(places)} places; each has its own")
         continuation = Continuation(
             request.map_id,
             _grid(request),

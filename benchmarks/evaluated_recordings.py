@@ -136,8 +136,8 @@ def tum_origin(sequence: Sequence) -> str:
     told = f"TUM RGB-D benchmark, {len(stamps_ns)} pairs over {seconds:.1f} s"
     if rate < 0.75 * KINECT_FPS:
         told += f", thinned to {rate:.0f} of the camera's {KINECT_FPS:.0f} frames a second"
-    if suffix != ".png":
-        told += f", colour as {suffix[1:].upper()} instead of PNG"
+    if suffix in (".jpg", ".jpeg"):
+        told += ", colour as JPEG instead of PNG"
     return told
 
 

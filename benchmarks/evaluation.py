@@ -207,9 +207,10 @@ def print_plan(cells: list[Cell], console: Console) -> None:
 def write_results(cells: list[Cell], failures: Failures, options: argparse.Namespace) -> None:
     """The JSON of this mode, and the document out of both modes'."""
     options.out.mkdir(parents=True, exist_ok=True)
+    arguments = shlex.join(word for word in sys.argv[1:] if word != "--quick")
+    command = "make benchmark-quick" if options.quick else "make benchmark"
     result = {
-        "command": "make benchmark-quick" if options.quick else "make benchmark",
-        "arguments": shlex.join(sys.argv[1:]),
+        "command": f"{command} BENCHMARK_ARGS={shlex.quote(arguments)}" if arguments else command,
         "machine": machine(LIBRARIES),
         "note": options.note,
         "cells": [cell.result for cell in cells if cell.result is not None],

@@ -148,6 +148,19 @@ def part_section(title: str, part: Mapping[str, Any], rows: Rows, picture: str) 
     return "\n".join(lines)
 
 
+def cuts(cells: Sequence[Cell]) -> list[str]:
+    """Which frames every method was given."""
+    by_frames: dict[str, list[str]] = {}
+    for method, name in NAMES.items():
+        for frames in dict.fromkeys(cell["frames"] for cell in cells if cell["method"] == method):
+            by_frames.setdefault(frames, []).append(name)
+    told = [
+        f"{', '.join(names)}: {'all frames' if frames == ':' else f'the frames `{frames}` alone'}"
+        for frames, names in by_frames.items()
+    ]
+    return [f"{'; '.join(told)}."] if told else []
+
+
 def versions(cells: Sequence[Cell]) -> list[str]:
     """Of which code and when, and how quiet the machine was."""
     if not cells:

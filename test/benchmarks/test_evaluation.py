@@ -79,9 +79,9 @@ def test_a_thinned_sequence_is_said_to_be_thinned(data):
     told = tum_origin(desk(data))
     assert f"{FRAMES} pairs" in told
     assert "15 of the camera's 30 frames" in told
-    assert "JPG" not in told
+    assert "JPEG" not in told
     (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text().replace(".png", ".jpg"))
-    assert "colour as JPG" in tum_origin(desk(data))
+    assert "colour as JPEG" in tum_origin(desk(data))
 
 
 @pytest.mark.parametrize(
@@ -253,6 +253,7 @@ def fabricated(recording: str, method: str, ate_m: float, **others: object) -> d
         "recording": recording,
         "origin": "made up",
         "method": method,
+        "frames": ":",
         "seed": 0,
         "frames_offered": 100,
         "frames_tracked": 99,
@@ -275,7 +276,7 @@ def fabricated(recording: str, method: str, ate_m: float, **others: object) -> d
 
 def document(folder: Path, stem: str, cells: list[dict[str, object]]) -> str:
     abacus = {"cpu": "abacus", "cores": 2, "instruction_sets": [], "versions": {}}
-    result = {"command": "make benchmark", "arguments": "", "machine": abacus, "note": ""}
+    result = {"command": "make benchmark", "machine": abacus, "note": ""}
     result |= {"cells": cells, "failures": {"room, tsdf, seed 1": "no memory is left"}}
     (folder / "benchmarks").mkdir(exist_ok=True)
     (folder / "benchmarks" / f"{stem}.json").write_text(json.dumps(result))
@@ -285,10 +286,11 @@ def document(folder: Path, stem: str, cells: list[dict[str, object]]) -> str:
 
 def test_the_document_tells_seeds_range_noise_and_failures(tmp_path):
     cells = [fabricated("room", "meslam", ate_m, seed=n) for n, ate_m in enumerate((0.01, 0.03))]
-    cells.append(fabricated("room", "tsdf", 0.05, others_cores=1.5))
+    cells.append(fabricated("room", "tsdf", 0.05, others_cores=1.5, frames=":300"))
     text = document(tmp_path, "evaluation", cells)
     assert "| MeSLAM, 2 seeds | 99 of 100 | 2.00 (1.00-3.00) |" in text
     assert "20.0 !" in text
+    assert "MeSLAM: all frames; TSDF SLAM (Open3D): the frames `:300` alone." in text
     assert "others computed during 1 of 3 cells" in text
     assert "**room, tsdf, seed 1** failed: no memory is left" in text
     assert "gives no answer to 3 trajectories" in text

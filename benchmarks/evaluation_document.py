@@ -124,19 +124,9 @@ def part_section(title: str, part: Mapping[str, Any], rows: Rows, picture: str) 
     """One mode: how it was made, and a table a recording."""
     cells = [cell for seeds in rows.values() for cell in seeds]
     cores = "/".join(sorted({str(cell["cores"]) for cell in cells})) or "-"
-    made = [
-        f"`{part['command']}`",
-        *([f"with `{part['arguments']}`"] if part["arguments"].strip("- ") else []),
-        f"on {machine_line(part['machine'])}; {cores} cores a run.",
-    ]
-    lines = [
-        f"## {title}",
-        "",
-        " ".join(made),
-        *versions(cells),
-        *([part["note"]] if part["note"] else []),
-        "",
-    ]
+    made = f"`{part['command']}` on {machine_line(part['machine'])}; {cores} cores a run."
+    note = [part["note"]] if part["note"] else []
+    lines = [f"## {title}", "", made, *cuts(cells), *versions(cells), *note, ""]
     lines += [f"![Errors, speed and map sizes]({picture})", ""]
     for recording in dict.fromkeys(name for name, _ in rows):
         mine = {method: seeds for (name, method), seeds in rows.items() if name == recording}

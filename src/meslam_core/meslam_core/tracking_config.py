@@ -206,8 +206,9 @@ class TrackingConfig:
         maximum=180.0,
     )
     certain_inlier_ratio: float = setting(
-        0.9,
-        "share of inliers from which on the map alone tells the pose where odometry has failed",
+        0.95,
+        "share of inliers from which on the map alone tells the pose where odometry has failed and "
+        "no keyframe knows the view",
         minimum=0.0,
         maximum=1.0,
     )

@@ -124,17 +124,26 @@ def test_without_odometry_a_fair_fit_is_a_guess_that_keyframes_confirm_or_refute
         assert tracking.take_refuted() is None
 
 
-def test_without_odometry_a_perfect_fit_needs_no_keyframe(mapped_room):
-    tracking = adrift(mapped_room)
+@pytest.mark.parametrize(
+    ("elsewhere_m", "state"), [(None, TrackingState.OK), (0.5, TrackingState.LOST)]
+)
+def test_without_odometry_a_perfect_fit_is_believed_unless_a_keyframe_knows_better(
+    mapped_room, elsewhere_m, state
+):
+    """A desk fits itself half a metre off."""
+    tracking, here = adrift(mapped_room), mapped_room.poses[0]
+    known = None
+    if elsewhere_m is not None:
+        known = here @ exp(np.array([elsewhere_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
     tracked = tracking.track(
         3 * PERIOD_NS,
         mapped_room.region,
         whole_view(mapped_room),
         odometry(valid=False),
-        lambda before: pytest.fail("asked"),
+        lambda before: known,
     )
-    assert tracking.state is TrackingState.OK
-    assert tracked.trusted
+    assert tracking.state is state
+    assert tracked.trusted is (state is TrackingState.OK)
 
 
 def test_without_odometry_a_poor_fit_is_not_trained(mapped_room):

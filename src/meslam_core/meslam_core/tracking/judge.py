@@ -77,7 +77,7 @@ class Judge:
         objection = unmapped or self._objection(stamp_ns, alignment, prior)
         if objection:
             return self._refused(prior, witness, objection)
-        if not path.doubted or path.certain(region, rays, alignment):
+        if not path.doubted:
             return Verdict(trusted=True, confirmed=True)
         return self._adrift(region, rays, alignment, witness)
 
@@ -121,7 +121,10 @@ class Judge:
     ) -> Verdict:
         """What is made of an alignment after odometry has failed."""
         path = self._path
-        known = witness(path.adrift_since) if path.asks() else None
+        asked = path.asks()
+        known = witness(path.adrift_since) if asked else None
+        if known is None and asked and path.certain(region, rays, alignment):
+            return Verdict(trusted=True, confirmed=True)
         if known is not None:
             distance, angle = motion_between(known, alignment.T_map_camera)
             if self._agree(distance, angle):

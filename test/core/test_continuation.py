@@ -83,12 +83,13 @@ def test_what_only_the_first_session_saw_is_not_forgotten(second, stored, room_f
 
 
 def test_localising_finds_poses_and_leaves_the_map_as_it_is(
-    stored, quick_config, room_frames, room_poses, tmp_path
+    stored, quick_config, room_frames, room_poses, tmp_path, caplog
 ):
     beside = room_poses[START] @ exp(np.array([0.01, 0.0, 0.005, 0.0, 0.017, 0.0]))
     continuation = replace(Continuation.read(stored, beside), train=False)
     options = RunOptions(continuation=continuation)
     run(MemoryRecording(room_frames[START:]), quick_config, tmp_path, options)
+    assert "does not confirm" not in caplog.text
     trajectory = read_tum(tmp_path / "trajectory.txt")
     assert len(trajectory) == len(room_poses) - START
     for pose, truth in zip(trajectory.poses, room_poses[START:], strict=True):
@@ -136,14 +137,15 @@ def test_remembered_views_lie_on_the_surface(stored, quick_config):
     assert np.median(surface_distance_m(np.concatenate(everywhere))) < 0.03
 
 
-def test_a_start_that_contradicts_the_map_spoils_nothing(
-    stored, quick_config, room_frames, room_poses, tmp_path
+def test_a_start_that_contradicts_the_map_is_told_and_spoils_nothing(
+    stored, quick_config, room_frames, room_poses, tmp_path, caplog
 ):
     wrong = room_poses[START] @ exp(np.array([0.0, 0.0, 0.4, 0.0, 0.5, 0.0]))
     options = RunOptions(continuation=Continuation.read(stored, wrong))
     run(MemoryRecording(room_frames[START : START + 3]), quick_config, tmp_path, options)
     before, after = (MapStore(p).manifest().regions for p in (stored, tmp_path / "map.meslam"))
     assert {e.sha256 for e in before} == {e.sha256 for e in after}
+    assert "does not confirm where the first image was taken" in caplog.text
 
 
 def test_a_damaged_map_is_not_continued(stored, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from contextlib import closing
@@ -28,6 +29,8 @@ from meslam_core.session_map import write_map
 from meslam_core.slam import FrameResult, Slam, TrackingState
 from meslam_core.threads import limit_threads
 from meslam_core.trajectory import Trajectory, read_tum, write_tum
+
+logger = logging.getLogger(__name__)
 
 
 class RunProgress(Protocol):
@@ -266,6 +269,8 @@ class _Loop:
                     self.tally.lateness_ms.append(late_ms)
                     self.skipped = paced.skipped
                 result = self.slam.map()
+                if not self.tally.frames:
+                    self._doubt_start(result)
                 self.tally.add(result, timed.reading_ms, timed.odometry_ms)
                 self._recorder.add(self.slam, result, timed, late_ms, self.skipped)
                 self._progress.processed(self.tally.frames + self.skipped, result)
@@ -273,6 +278,15 @@ class _Loop:
                     self.interrupted = True
                     return
         self.slam.wait()
+
+    def _doubt_start(self, first: FrameResult) -> None:
+        """Warn where the first image shows nothing of the map that is gone on with."""
+        if self._options.continuation is not None and first.reason:
+            logger.warning(
+                "the stored map does not confirm where the first image was taken: %s; if the start "
+                "pose is wrong, what is mapped now does not fit the rest",
+                first.reason,
+            )
 
     def _frames_wait(self) -> bool:
         """Whether mapping is to give way: only at the recording's pace can it be too slow."""
@@ -293,6 +307,7 @@ class _Loop:
             "recording": self._recording.name,
             **self._options.entries(self._recording.path),
             "camera": self._recording.camera.to_dict(),
+            "topics": self._recording.topics,
             "seed": self._options.seed,
             "realtime": self._options.realtime,
             "config": self._config.to_mapping(),

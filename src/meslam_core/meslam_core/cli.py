@@ -176,7 +176,7 @@ def run(
 
     RECORDING is a rosbag2 folder, an .mcap, .db3 or .bag file, a TUM folder, or a folder with
     color/, depth/ and camera.json. Writes trajectory.txt, trajectory_online.txt with
-    covariance_online.txt, map.meslam and report.json.
+    covariance_online.txt, map.meslam, frames.csv and report.json; `meslam report` shows them.
     """
     from meslam_core.config import MeslamConfig
 

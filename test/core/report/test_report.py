@@ -11,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from data.memory_recording import MemoryRecording
 from data.run_folders import copied_run
 from PIL import Image
 from typer.testing import CliRunner
 
 from meslam_core.cli import app
 from meslam_core.errors import EvaluationError
+from meslam_core.recordings import convert, open_recording
 from meslam_core.report import read_run, write_report
 from meslam_core.report.result_table import result_groups
 
@@ -175,6 +177,18 @@ def test_without_a_map_and_a_path_the_rest_is_shown(make_run):
     assert "<svg" in section(page, "tracking")
 
 
+def test_the_recording_is_read_as_the_run_read_it(make_run, room_frames, tmp_path):
+    bag = tmp_path / "walk.mcap"
+    convert(MemoryRecording(room_frames[:2]), bag)
+    topics = open_recording(bag).topics
+    for color, found in ((topics["color"], True), ("/camera/nowhere", False)):
+        folder = make_run(f"run{found}", recording_path=str(bag), topics=topics | {"color": color})
+        run = read_run(folder)
+        run.close()
+        assert (run.recording is not None) == found
+        assert any("/camera/nowhere" in sentence for sentence in run.missing) != found
+
+
 def test_a_damaged_region_is_named(make_run):
     folder = make_run()
     file = next((folder / "map.meslam").glob("region_*"))
@@ -230,8 +244,9 @@ def test_a_damaged_folder_is_refused_in_words(make_run, name, content):
 
 def test_entries_of_any_kind_do_no_harm(make_run):
     strange = {
-        "stage_ms": 3, "config": {"mapping": [1]}, "camera": {"width": "wide"}, "machine": "big",
-        "versions": [], "frame_range": "all", "ate_rmse_m": "small", "map_bytes": None, "seed": [],
+        "stage_ms": 3, "topics": {"color": 3, "mood": "x"}, "config": {"mapping": [1]},
+        "camera": {"width": "wide"}, "machine": "big", "versions": [], "frame_range": "all",
+        "ate_rmse_m": "small", "map_bytes": None, "seed": [],
     }  # fmt: skip
     page = made(make_run(**strange))
     assert "does not tell how long" in page.text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.reader import read_map
 from meslam_core.recordings import open_recording
 from meslam_core.recordings.recording import Recording
+from meslam_core.recordings.topics import RecordingTopics
 from meslam_core.results import MAP, ONLINE_TRAJECTORY, REPORT, TRAJECTORY
 from meslam_core.trajectory import Trajectory, read_tum
 
@@ -174,7 +175,7 @@ def _open_recording(run: RunFolder, given: Path | None) -> None:
         )
         return
     try:
-        run.recording = _opened(path, run.camera)
+        run.recording = _opened(path, run.camera, _topics(run.entries))
     except RecordingError as error:
         if given is not None:
             raise
@@ -188,18 +189,28 @@ def _intrinsics(entries: Mapping[str, Any]) -> PinholeCamera | None:
     return None
 
 
-def _opened(path: Path, intrinsics: PinholeCamera | None) -> Recording:
-    """A recording with the intrinsics of the run, which may have been given to it."""
+def _topics(entries: Mapping[str, Any]) -> RecordingTopics:
+    """The topics that the run read, where its recording has any."""
+    topics = entries.get("topics")
+    roles = [each.name for each in fields(RecordingTopics)]
+    named = topics.items() if isinstance(topics, Mapping) else ()
+    return RecordingTopics(
+        **{role: name for role, name in named if role in roles and isinstance(name, str)}
+    )
+
+
+def _opened(path: Path, intrinsics: PinholeCamera | None, topics: RecordingTopics) -> Recording:
+    """A recording with the intrinsics and topics of the run, which may have been given to it."""
     try:
-        recording = open_recording(path)
+        recording = open_recording(path, topics=topics)
     except RecordingError:
         if intrinsics is None:
             raise
-        return open_recording(path, intrinsics)
+        return open_recording(path, intrinsics, topics)
     if intrinsics is None or recording.camera == intrinsics:
         return recording
     recording.close()
-    return open_recording(path, intrinsics)
+    return open_recording(path, intrinsics, topics)
 
 
 def _named_path(entries: Mapping[str, Any], name: str) -> Path | None:

@@ -8,7 +8,7 @@ import numpy as np
 from data.ros_camera import Messages
 from faults.live_graph import Change, LiveGraph
 from faults.live_trial import CAMERA_SIDE, WITH_MAP, Disturbance, live, refused
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 
 from meslam_interfaces.msg import TrackingStatus
 from meslam_ros.conversions import byte_array, to_stamp
@@ -127,13 +127,45 @@ def no_colour_for_a_while(graph: LiveGraph) -> str:
     return "the log names the stream that stopped, and what found no partner is counted"
 
 
+def no_camera_info(graph: LiveGraph) -> str:
+    """The driver's camera_info has another name."""
+    sent_well = graph.camera.info
+    graph.camera.info = graph.client.node.create_publisher(CameraInfo, "elsewhere/camera_info", 1)
+    seen = refused([graph.track() for _ in range(BAD_IMAGES)], "no camera_info has come", INFO)
+    graph.camera.info = sent_well
+    return seen
+
+
+def no_base(graph: LiveGraph) -> str:
+    """Nobody tells where the camera sits on the robot."""
+    status = graph.track_well()
+    graph.logged("tracking_node", "/tf_static does not connect", "base_frame")
+    return f"{status.frames_tracked} tracked, the optical frame is the base, the log says so"
+
+
 FAULTS = (
+    live(
+        "live-camera-info-missing",
+        "no camera_info from the start",
+        "refused with the topic and what is missing; tracked as soon as it comes",
+        no_camera_info,
+        CAMERA_SIDE,
+        from_start=True,
+    ),
+    live(
+        "live-tf-missing",
+        "no transform between the camera and its base",
+        "tracked with the optical frame as the base; the log says so and how to mend it",
+        no_base,
+        CAMERA_SIDE,
+        from_start=True,
+        mounted=False,
+    ),
     live(
         "live-depth-nan",
         "32FC1 depth images of NaN in a live stream",
         UNTRUSTED,
         cannot_be_trusted(depth(lambda mm: np.full(mm.shape, np.nan, np.float32)), "depth"),
-        quick=True,
     ),
     live(
         "live-depth-zero",

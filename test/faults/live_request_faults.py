@@ -160,7 +160,6 @@ FAULTS = (
         REFUSED,
         all_refused(paths),
         MAP_SIDE,
-        quick=True,
     ),
     live(
         "live-service-points",

@@ -28,6 +28,7 @@ def live(
     disturb: Disturbance,
     nodes: tuple[str, ...] = WITH_MAP,
     same_map: bool = True,
+    from_start: bool = False,
     quick: bool = False,
     alone: bool = False,
     limit_s: float = 120.0,
@@ -40,6 +41,7 @@ def live(
         disturb: does it, asserts what must be seen meanwhile, and tells it in words.
         nodes: to start. With a map server, the map is saved at the end and must load.
         same_map: whether tracking must go on in the map from before.
+        from_start: whether it is so before there is a map.
         parameters: of all nodes.
     """
 
@@ -47,7 +49,7 @@ def live(
         ros_domain.enter()
         with live_graph(bench.folder, nodes=nodes, **parameters) as graph:
             try:
-                return Seen(f"{_trial(graph, disturb, same_map)}", {"problem": ""})
+                return Seen(f"{_trial(graph, disturb, same_map, from_start)}", {"problem": ""})
             except AssertionError as error:
                 (bench.folder / "logs.txt").write_text(graph.logs())
                 return Seen("", {"problem": str(error).split("\n")[0]})
@@ -65,13 +67,14 @@ def live(
     )
 
 
-def _trial(graph: LiveGraph, disturb: Disturbance, same_map: bool) -> str:
-    before = graph.track_well()
+def _trial(graph: LiveGraph, disturb: Disturbance, same_map: bool, from_start: bool) -> str:
+    before = None if from_start else graph.track_well()
     seen = disturb(graph)
     sent = len(graph.client.statuses)
     after = graph.track_well()
     needed = len(graph.client.statuses) - sent
-    assert not same_map or after.map_id == before.map_id, "a new map was begun"
+    goes_on = before is None or after.map_id == before.map_id
+    assert goes_on or not same_map, "a new map was begun"
     if "map_server_node" in graph.processes:
         graph.settle()
         saved = graph.client.call(SaveMap, topics.SAVE_MAP, SaveMap.Request(name="room.meslam"))

@@ -268,10 +268,14 @@ def damaged(kind: str, region: StoredRegion) -> RegionModel:
         message.index = [3, 3, 3]
     elif kind == "version":
         message.version += 1
+    elif kind == "box":
+        message.pose.position.x += 1.0
     return message
 
 
-@pytest.mark.parametrize("kind", ["bytes", "truncated", "format", "empty", "index", "version"])
+@pytest.mark.parametrize(
+    "kind", ["bytes", "truncated", "format", "empty", "index", "version", "box"]
+)
 def test_damaged_models_are_refused_and_counted(server, client, regions, capfd, kind) -> None:
     reports: list[DiagnosticStatus] = []
     client.node.create_subscription(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from data.analytic_scene import GRID, SphereInRoom, learnt_field, stored
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
@@ -144,3 +145,29 @@ def test_newest_version_counts_and_a_new_map_replaces_the_old(start_node, client
     assert client.spin_until(lambda: len(states(client)) == 1, WAIT_S)
     client.spin_until(lambda: False, 0.5)
     assert [list(region.index) for region in client.regions.regions] == [[1, 0, 0]]
+
+
+@pytest.mark.parametrize("kind", ["bytes", "pose", "size"])
+def test_unusable_models_are_refused_and_counted(start_node, client, regions, kind) -> None:
+    """A number that is none must not end the node that draws the boxes."""
+    start_node(RegionManagerNode)
+    reports: list[DiagnosticStatus] = []
+    client.node.create_subscription(
+        DiagnosticArray, topics.DIAGNOSTICS, lambda m: reports.extend(m.status), STREAM
+    )
+    tracking = Tracking(client)
+    bad = model(replace(regions[1], version=regions[1].version + 1))
+    if kind == "bytes":
+        bad.data[100] ^= 1
+    elif kind == "pose":
+        bad.pose.position.x = float("nan")
+    else:
+        bad.size_m.x = -1.0
+    tracking.publish(bad)
+    tracking.publish(model(regions[0]))
+    assert client.spin_until(
+        lambda: any("region models refused: 1" in report.message for report in reports), WAIT_S
+    )
+    assert client.spin_until(
+        lambda: client.regions is not None and len(client.regions.regions) == 1, WAIT_S
+    )

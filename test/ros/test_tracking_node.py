@@ -191,6 +191,40 @@ def test_odometry_that_is_started_again_is_no_motion(start_node, client, topic: 
         assert np.linalg.norm((inverse(truth) @ T_map_base)[:3, 3]) < 0.015
 
 
+@pytest.mark.parametrize("field", ["position", "rotation", "covariance"])
+def test_odometry_that_is_none_is_told_and_not_used(start_node, client, field) -> None:
+    start_node(TrackingNode, **FAST)
+    odometry = client.node.create_publisher(Odometry, topics.ODOMETRY, STREAM)
+    camera = Camera(client)
+    camera.wait()
+    assert client.spin_until(lambda: odometry.get_subscription_count() == 1, ANSWER_S)
+    reports = diagnosed(client)
+    message = Odometry(child_frame_id=BASE_FRAME)
+    message.header.frame_id = "odom"
+    message.pose.pose.orientation.w = 1.0
+    if field == "position":
+        message.pose.pose.position.x = float("nan")
+    elif field == "rotation":
+        message.pose.pose.orientation.w = 1e-200
+    else:
+        message.twist.covariance = np.full(36, np.nan)
+    for number in range(2):
+        message.header.stamp = to_stamp(NANOSECONDS + number * PERIOD_NS)
+        odometry.publish(message)
+        status = camera.track(number)
+        assert status.state == TrackingStatus.OK
+        assert not status.odometry_valid
+    refused = "0" if field == "covariance" else "2"
+    assert client.spin_until(
+        lambda: any(
+            value.key == "odometry_refused" and value.value == refused
+            for report in reports
+            for value in report.values
+        ),
+        ANSWER_S,
+    )
+
+
 def test_only_the_first_image_waits_for_odometry_that_is_silent(start_node, client) -> None:
     """One that was killed counts as a publisher until the middleware notices."""
     timeout_s = 4.0
@@ -284,6 +318,23 @@ def test_a_shorter_queue_counts_at_once_and_says_what_it_dropped(start_node, cli
     assert last.frames_dropped > 0
     assert last.frames_tracked == 8 - last.frames_dropped
     assert f"queue full: {last.frames_dropped}" in last.drop_reasons
+
+
+def test_a_computer_that_is_too_slow_says_so(start_node, client) -> None:
+    slow = {"mapping__iterations": 600, "give_way": False, "queue_size": 1}
+    start_node(TrackingNode, **FAST | slow)
+    reports = diagnosed(client)
+    camera = Camera(client)
+    camera.wait()
+    camera.track(0)
+    for number in range(1, 12):
+        camera.send(number)
+    assert client.spin_until(lambda: client.statuses[-1].frames_received == 12, ANSWER_S)
+    last = client.statuses[-1]
+    assert last.state == TrackingStatus.DEGRADED
+    assert "of the last 12 image pairs were skipped" in last.reason
+    assert client.last_stamp_ns in client.poses
+    assert client.spin_until(lambda: any("overloaded" in r.message for r in reports), ANSWER_S)
 
 
 def test_the_effort_of_training_changes_while_it_runs(start_node, client) -> None:

@@ -137,3 +137,16 @@ def test_short_and_damaged_images_are_errors() -> None:
             decode_color(data)
     with pytest.raises(RecordingError, match="uint8 pixels"):
         decode_depth(png(RGB))
+
+
+@pytest.mark.parametrize("empty", [{"width": 0}, {"height": 0}, {"width": 0, "height": 0}])
+def test_images_without_pixels_are_errors(empty: dict[str, int]) -> None:
+    with pytest.raises(RecordingError, match="no pixels"):
+        color_from_message(image(RGB, "rgb8", **empty, step=0, data=np.empty(0, np.uint8)))
+    with pytest.raises(RecordingError, match="no pixels"):
+        depth_from_message(image(DEPTH_MM, "16UC1", **empty))
+
+
+def test_an_odd_width_cannot_be_yuv() -> None:
+    with pytest.raises(RecordingError, match="7 pixels wide"):
+        color_from_message(image(RGB[:, :7, :2].copy(), "yuv422"))

@@ -110,13 +110,15 @@ class BackgroundMap:
         self._refuse_export("the viewer is being closed")
 
     def _run(self) -> None:
-        failures = 0
+        failures, complaint = 0, ""
         while not self._stopping.is_set():
             try:
                 if not self._step():
                     self._stopping.wait(POLL_S)
             except MapError as error:
-                logger.warning("the viewer's mesh: %s", error)
+                if str(error) != complaint:
+                    complaint = str(error)
+                    logger.warning("the viewer's mesh: %s", complaint)
                 self._stopping.wait(SETTLED_S)
             except (EOFError, OSError):
                 if self._stopping.is_set():

@@ -39,7 +39,7 @@ JPEG_QUALITY = 70
 BOX_EDGES = np.array([(a, a | 1 << axis) for axis in range(3) for a in range(8) if ~a >> axis & 1])
 # From behind the left, above: the map's x axis points away.
 OVERVIEW_DIRECTION = np.array([-0.55, 0.35, 0.76])
-OVERVIEW_DISTANCE = 0.85
+OVERVIEW_DISTANCE = 0.58
 FOLLOW_BACK_M, FOLLOW_UP_M = 1.6, 0.7
 # glTF has y up, the map z.
 WXYZ_MAP_GLTF = (0.5**0.5, 0.5**0.5, 0.0, 0.0)

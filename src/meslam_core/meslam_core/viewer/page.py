@@ -56,6 +56,7 @@ class Page:
         self._controls = controls
         self._server = PageServer(host, port)
         self._shown: dict[str, tuple[int, float]] = {}
+        self._told: tuple[tuple[int, ...], float] = ((), float("-inf"))
         self._canvas = Canvas(self._server.scene)
         self._server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND_COLOR
@@ -111,7 +112,7 @@ class Page:
             self._renew("regions", scene.regions, canvas.regions)
             self._renew("mesh", scene.surfaces, canvas.surfaces)
             self._renew("occupancy", scene.occupancy, canvas.occupancy)
-            self._renew("status", scene.status, self._show_status, STATUS_PERIOD_S)
+            self._renew_status()
         canvas.take_leave()
 
     def _renew(
@@ -140,8 +141,13 @@ class Page:
     def _show_refined(self, path: NDArray[np.float64]) -> None:
         self._canvas.path("refined_path", path)
 
-    def _show_status(self, _: object) -> None:
-        self._panel.show_status(self._scene)
+    def _renew_status(self) -> None:
+        """Tell the figures, which are those of several parts."""
+        parts = (self._scene.status, self._scene.regions, self._scene.surfaces)
+        revisions, now = tuple(part.revision for part in parts), time.monotonic()
+        if revisions != self._told[0] and now - self._told[1] >= STATUS_PERIOD_S:
+            self._told = revisions, now
+            self._panel.show_status(self._scene)
 
     def _look_over(self, client: viser.ClientHandle) -> None:
         look_over(client.camera, self._scene.bounds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import io
 import json
 import re
@@ -164,6 +165,21 @@ def test_what_a_run_has_not_is_said(make_run, tmp_path):
     assert len(page.images["map from the same pose"]) == 1
     assert 'id="tracking"' not in page.source
     assert "median" in section(page, "time")
+
+
+def test_columns_that_were_not_recorded_are_named(make_run):
+    folder = make_run()
+    rows = list(csv.reader((folder / "frames.csv").open()))
+    for row in rows[1:]:
+        row[rows[0].index("odometry_ms")] = row[rows[0].index("rss_mb")] = ""
+    with (folder / "frames.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    run = read_run(folder)
+    run.close()
+    (note,) = [sentence for sentence in run.missing if sentence.startswith("Over time")]
+    assert "odometry" in note
+    assert "memory" in note
+    assert "tracking" not in note
 
 
 def test_without_a_map_and_a_path_the_rest_is_shown(make_run):

@@ -24,6 +24,19 @@ from meslam_core.trajectory import Trajectory, read_tum
 
 REMEDY = "make it anew: meslam run RECORDING --out DIR"
 MIN_POSES = 2
+# What the report shows over time, and how it is called where it was not recorded. The size of the
+# map is told at the end in any case; a run of a few frames ends before it is first measured.
+OVER_TIME = {
+    "residual_m": "residual",
+    "loss_distance": "losses",
+    "reading_ms": "time of reading",
+    "odometry_ms": "time of odometry",
+    "tracking_ms": "time of tracking",
+    "mapping_ms": "time of mapping",
+    "regions": "number of regions",
+    "keyframes": "number of keyframes",
+    "rss_mb": "memory",
+}
 
 
 @dataclass
@@ -92,14 +105,7 @@ def read_run(
     run = RunFolder(path.resolve().name, path, _entries(path))
     run.refined = _trajectory(run, TRAJECTORY)
     run.online = _trajectory(run, ONLINE_TRAJECTORY)
-    if (path / FRAMES).is_file():
-        run.frames = read_frame_log(path / FRAMES)
-    if run.frames is None or not len(run.frames):
-        run.frames = None
-        run.missing.append(
-            f"State, losses and times of single frames: there is no {FRAMES}; a run of this "
-            "version writes it."
-        )
+    _read_frames(run)
     run.camera = _intrinsics(run.entries)
     _compare(run, truth, lever_arm)
     _open_map(run)
@@ -133,6 +139,22 @@ def _trajectory(run: RunFolder, name: str) -> Trajectory | None:
         raise EvaluationError(f"{run.path} is not whole: no {name}; {REMEDY}")
     trajectory = read_tum(file)
     return trajectory if len(trajectory) >= MIN_POSES else None
+
+
+def _read_frames(run: RunFolder) -> None:
+    """Read what is told of single frames, and say what is not."""
+    file = run.path / FRAMES
+    table = read_frame_log(file) if file.is_file() else None
+    if table is None or not len(table):
+        run.missing.append(
+            f"State, losses and times of single frames: there is no {FRAMES}; a run of this "
+            "version writes it."
+        )
+        return
+    run.frames = table
+    unknown = [name for column, name in OVER_TIME.items() if not table.known(column)]
+    if unknown:
+        run.missing.append(f"Over time: {', '.join(unknown)}; {FRAMES} does not tell.")
 
 
 def _compare(run: RunFolder, given: Path | None, lever_arm: bool) -> None:

@@ -30,6 +30,7 @@ import msgspec
 import viser
 import zstandard
 from machine import machine, machine_line
+from node_latency import cpu_s
 from rich.console import Console
 from rich.table import Table
 from websockets.exceptions import ConnectionClosed
@@ -157,7 +158,7 @@ def play(frames: int, view: bool) -> PlayedRun:
             spectator = Spectator(url)
             stack.callback(spectator.close)
         until(client, lambda: set(NODES) <= set(client.node.get_node_names()), slam)
-        before_s = cpu_s(viewer)
+        before_s = viewer_cpu_s(viewer)
         started = time.monotonic()
         playing = {
             "recording": RECORDING,
@@ -168,7 +169,7 @@ def play(frames: int, view: bool) -> PlayedRun:
         player = stack.enter_context(node("bag_player_node", playing, folder))
         if not client.spin_until(lambda: player.status is not None, PLAYING_S) or player.status:
             raise SystemExit(f"the player fails:\n{player.output()}\n{slam.output()}")
-        cpu = (cpu_s(viewer) - before_s) / (time.monotonic() - started)
+        cpu = (viewer_cpu_s(viewer) - before_s) / (time.monotonic() - started)
         # The first frame's time holds the training of the first region's 300 steps.
         fps = (len(arrived) - 2) / (arrived[-1] - arrived[1])
         return PlayedRun(fps, None if spectator is None else seen(spectator, arrived, cpu))
@@ -209,16 +210,12 @@ def until(client: MeslamClient, holds, process: NodeProcess) -> None:
         raise SystemExit(f"the nodes do not start:\n{process.output()}")
 
 
-def cpu_s(process: NodeProcess | None) -> float:
-    """Processor time of a process and its children so far [s] (Linux)."""
-    if process is None:
+def viewer_cpu_s(viewer: NodeProcess | None) -> float:
+    """Processor time of the viewer and its map process so far [s] (Linux)."""
+    if viewer is None:
         return 0.0
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    ticks = 0
-    for pid in (process.pid, *children):
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
+    children = Path(f"/proc/{viewer.pid}/task/{viewer.pid}/children").read_text().split()
+    return sum(map(cpu_s, (viewer.pid, *map(int, children))))
 
 
 def table_of(runs: list[tuple[PlayedRun, PlayedRun]], loss: float) -> Table:

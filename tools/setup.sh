@@ -11,7 +11,8 @@
 #                    insists on the wheels
 # MESLAM_JOBS        compilers to run at the same time; by default one a core
 # MESLAM_SKIP_APT=1  the system packages are there, however they came
-# MESLAM_BROWSER=1   install the browser too that the viewer's tests need
+# MESLAM_BROWSER=1   install the browser too that the viewer's tests need (Debian; Ubuntu has it
+#                    as a snap: snap install chromium)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

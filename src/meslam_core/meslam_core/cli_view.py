@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -49,7 +50,8 @@ def view(
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    with Viewer(host, port, ViewControls(mesh_resolution_m=resolution), eager=True) as viewer:
+    controls = ViewControls(mesh_resolution_m=resolution)
+    with closing(Viewer(host, port, controls, eager=True)) as viewer:
         with waiting("reading what the run left"):
             run = FinishedRun(viewer, path, recording)
         try:

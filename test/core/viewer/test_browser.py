@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,8 @@ MANY, SOME = 300, 40
 
 @pytest.fixture(scope="module")
 def viewer(run_folder: Path) -> Iterator[Viewer]:
-    with Viewer(port=0, controls=ViewControls(mesh_resolution_m=0.06), eager=True) as viewer:
+    controls = ViewControls(mesh_resolution_m=0.06)
+    with closing(Viewer(port=0, controls=controls, eager=True)) as viewer:
         run = FinishedRun(viewer, run_folder)
         assert run.missing == []
         yield viewer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from meslam_core.viewer.viewer import Viewer
 
 @pytest.fixture(scope="module")
 def viewer() -> Iterator[Viewer]:
-    with Viewer(port=0) as viewer:
+    with closing(Viewer(port=0)) as viewer:
         yield viewer
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-
 from meslam_core.viewer.background_map import BackgroundMap
 from meslam_core.viewer.page import Page
 from meslam_core.viewer.scene import Scene, ViewControls
@@ -12,8 +10,6 @@ from meslam_core.viewer.server import DEFAULT_HOST, DEFAULT_PORT
 
 class Viewer:
     """A scene on a page, with the meshes of the models that it is given.
-
-    A context manager, which closes it.
 
     Args:
         host, port: where the page is served, as of `PageServer`.
@@ -43,14 +39,3 @@ class Viewer:
         """Take the page away and end the background work."""
         self.page.close()
         self.map.close()
-
-    def __enter__(self) -> Viewer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()

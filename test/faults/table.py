@@ -27,6 +27,8 @@ last column, the same holds for all of them, and is checked for all of them:
   documented is missed;
 - no map is lost: every map that was stored before or during the fault loads whole afterwards,
   except where the fault itself damages the stored map.
+
+What the fuzzers did and how whole runs were killed at random is in [reliability/](reliability/).
 """
 TITLES = {
     Group.INPUT: "Images, stamps and calibration",

@@ -36,6 +36,8 @@ STATE_NAMES = {
 }
 RATE_WINDOW_S = 3.0
 SILENCE_S = 3.0
+# Positions of the path that are nearer to each other look the same.
+STEP_M = 0.005
 # Axes of an optical frame (x right, y down, z ahead) in those of a body (x ahead, z up).
 T_BODY_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -62,7 +64,8 @@ class LiveScene:
         self._live_map_id = ""
         self._camera: PinholeCamera | None = None
         self._camera_frame = ""
-        self._positions: list[NDArray[np.float64]] = []
+        self._path = np.empty((1, 3))
+        self._passed = 0
         self._arrivals: deque[float] = deque()
         self._heard_s: float | None = None
         scene.status.set(
@@ -90,9 +93,10 @@ class LiveScene:
     def take_pose(self, message: PoseStamped) -> None:
         """Take the base's pose of a frame."""
         T_map_camera = from_pose(message.pose) @ self._T_base_camera()
-        self._positions.append(T_map_camera[:3, 3])
         self._scene.camera.set(camera_view(T_map_camera, self._camera))
-        self._scene.online_path.set(np.array(self._positions))
+        position = T_map_camera[:3, 3]
+        if not self._passed or np.linalg.norm(position - self._path[self._passed - 1]) > STEP_M:
+            self._extend_path(position)
 
     def take_path(self, message: Path) -> None:
         """Take the refined path."""
@@ -156,10 +160,18 @@ class LiveScene:
         """Another map: what is known of the one before is forgotten."""
         self._catalog.begin(map_id)
         self._background.begin()
-        self._positions.clear()
+        self._path, self._passed = np.empty((1, 3)), 0
         self._scene.online_path.set(np.zeros((0, 3)))
         self._scene.refined_path.set(np.zeros((0, 3)))
         self._show_regions()
+
+    def _extend_path(self, position: NDArray[np.float64]) -> None:
+        """One more position of the path, which is never copied but when its room is used up."""
+        if self._passed == len(self._path):
+            self._path = np.concatenate([self._path, np.empty_like(self._path)])
+        self._path[self._passed] = position
+        self._passed += 1
+        self._scene.online_path.set(self._path[: self._passed])
 
     def _T_base_camera(self) -> se3.Pose:
         known = self._mount(self._camera_frame) if self._camera_frame else None

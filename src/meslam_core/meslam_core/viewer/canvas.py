@@ -23,6 +23,7 @@ Color = tuple[int, int, int]
 
 # The new mesh is there before the old one goes.
 MESH_HANDOVER_S = 0.7
+MESH_NAMES = 32
 STATE_COLORS: dict[RegionState, Color] = {
     RegionState.AT_REST: (150, 155, 165),
     RegionState.TRAINING: (242, 191, 51),
@@ -153,7 +154,8 @@ class Canvas:
         if not glb:
             return
         # A node whose mesh changes shows nothing until the browser has read the new one.
-        self._meshes += 1
+        # Names come again, for the server remembers every name that was ever removed.
+        self._meshes = (self._meshes + 1) % MESH_NAMES
         self._nodes[name] = self._space.add_glb(
             f"/{name}/{self._meshes}",
             glb,

@@ -24,6 +24,7 @@ logger = logging.getLogger(__name__)
 TICK_S = 0.04
 IMAGE_PERIOD_S = 0.08
 PATH_PERIOD_S = 0.4
+LONG_PATH = 2000
 STATUS_PERIOD_S = 0.3
 BRAND_COLOR = (56, 160, 102)
 
@@ -107,8 +108,8 @@ class Page:
         with self._server.atomic():
             self._renew("camera", scene.camera, self._show_camera)
             self._renew("image", scene.image, self._show_image, IMAGE_PERIOD_S)
-            self._renew("online_path", scene.online_path, self._show_online, PATH_PERIOD_S)
-            self._renew("refined_path", scene.refined_path, self._show_refined, PATH_PERIOD_S)
+            self._renew_path("online_path", scene.online_path)
+            self._renew_path("refined_path", scene.refined_path)
             self._renew("regions", scene.regions, canvas.regions)
             self._renew("mesh", scene.surfaces, canvas.surfaces)
             self._renew("occupancy", scene.occupancy, canvas.occupancy)
@@ -135,11 +136,10 @@ class Page:
         if image is not None:
             self._panel.show_image(image)
 
-    def _show_online(self, path: NDArray[np.float64]) -> None:
-        self._canvas.path("online_path", path)
-
-    def _show_refined(self, path: NDArray[np.float64]) -> None:
-        self._canvas.path("refined_path", path)
+    def _renew_path(self, name: str, path: Part[NDArray[np.float64]]) -> None:
+        """Send a path, which is sent whole, less often when it grows long."""
+        period_s = PATH_PERIOD_S * (1.0 + len(path.value) / LONG_PATH)
+        self._renew(name, path, lambda positions: self._canvas.path(name, positions), period_s)
 
     def _renew_status(self) -> None:
         """Tell the figures, which are those of several parts."""

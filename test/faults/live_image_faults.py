@@ -198,8 +198,8 @@ FAULTS = (
     live(
         "live-depth-float-millimetres",
         "32FC1 depth in millimetres in a live stream",
-        "DEGRADED, the reason asks for the unit; the pose comes back in the same map",
-        cannot_be_trusted(depth(lambda mm: mm.astype(np.float32)), "unit"),
+        "DEGRADED, the reason names the unit; the pose comes back in the same map",
+        cannot_be_trusted(depth(lambda mm: mm.astype(np.float32)), "millimetres taken as metres"),
         CAMERA_SIDE,
     ),
     live(

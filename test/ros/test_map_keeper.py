@@ -64,6 +64,30 @@ def test_a_map_is_found_again_by_the_next_server(tmp_path, region) -> None:
     assert second.models.add(model(region, version=4))
 
 
+def test_the_same_map_again_replaces_nothing(tmp_path, region) -> None:
+    server = Server(tmp_path / "recent")
+    server.models.add(model(region))
+    server.models.save(tmp_path / "room.meslam")
+    server.keeper.keep()
+    server.models.load(tmp_path / "room.meslam")
+    assert server.said == []
+    server.models.add(model(region, SECOND))
+    assert len(server.said) == 1
+
+
+def test_why_a_map_is_not_kept_is_known_until_it_is(tmp_path, region) -> None:
+    folder = tmp_path / "recent"
+    folder.write_text("in the way")
+    server = Server(folder)
+    server.models.add(model(region))
+    server.keeper.keep()
+    assert str(folder) in server.keeper.failure
+    folder.unlink()
+    server.keeper.keep()
+    assert server.keeper.failure == ""
+    assert versions(folder / FIRST) == {(0, 0, 0): 1}
+
+
 def test_a_map_is_written_only_when_it_has_changed(tmp_path, region) -> None:
     server = Server(tmp_path)
     manifest = tmp_path / FIRST / "manifest.json"

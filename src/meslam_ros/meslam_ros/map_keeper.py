@@ -112,10 +112,10 @@ class MapKeeper:
             self._kept = versions
             self._pause_s = (time.monotonic() - started) / WRITE_SHARE
 
-    def _keep_replaced(self) -> None:
+    def _keep_replaced(self, next_id: str) -> None:
         self.keep()
         map_id, _ = self._kept
-        if map_id and map_id == self._models.map_id:
+        if map_id and map_id == self._models.map_id != next_id:
             path = self._folder / _folder_name(map_id)
             self._inform(f"another map takes the place of {map_id}, which is kept in {path}")
 

@@ -75,11 +75,12 @@ class MapModels:
         map_frame: of the regions' poses.
 
     Attributes:
-        before_replacing: called before another map takes the place of the one that is there.
+        before_replacing: called with the identity of a map before that takes the place of the one
+            that is there.
     """
 
     def __init__(self, config: MeslamConfig, map_frame: str) -> None:
-        self.before_replacing: Callable[[], None] = lambda: None
+        self.before_replacing: Callable[[str], None] = lambda map_id: None
         self._catalog = RegionCatalog()
         self._config = config
         self._map_frame = map_frame
@@ -106,7 +107,7 @@ class MapModels:
                 return False
         region = self._placed(stored_region(model))
         if model.map_id != self.map_id:
-            self.before_replacing()
+            self.before_replacing(model.map_id)
         with self._lock:
             if not self._is_wanted(model):
                 return False
@@ -204,7 +205,7 @@ class MapModels:
         ]
         placed = [self._placed(region) for region in loaded.regions]
         confirm(loaded, models)
-        self.before_replacing()
+        self.before_replacing(loaded.map_id)
         with self._lock:
             self._begin(loaded.map_id)
             self._lattice = loaded.grid

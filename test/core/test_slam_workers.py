@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from meslam_core.config import MeslamConfig
+from meslam_core.evaluation.relocalisation import mirrored
 from meslam_core.mapping.frame_training import FIRST_STEPS_SHARE, MADE_UP_A_FRAME
 from meslam_core.odometry import make_odometry
 from meslam_core.slam import Slam, TrackingState
+from meslam_core.tracking.judge import Judge
 
 FIRST, LEAST, STEPS = 100, 3, 8
 FIRST_LEAST = math.ceil(FIRST_STEPS_SHARE * FIRST)
@@ -187,13 +189,20 @@ def test_what_training_raises_reaches_the_caller(config, offered, monkeypatch):
         slam.wait()
 
 
-def test_where_the_map_lags_behind_valid_odometry_keyframes_are_trained_and_the_frame_is_not(
-    config, offered
+def test_where_the_map_lags_behind_what_a_keyframe_shows_training_does_not_give_way(
+    config, offered, monkeypatch
 ):
-    slam = Slam(config, frames_wait=lambda: True)
-    steps_of(slam, offered[:3])
-    keyframes = len(slam.keyframes)
-    nearer = [(replace(f, depth_m=0.8 * f.depth_m), odometry) for f, odometry in offered[3:5]]
-    assert steps_of(slam, nearer) == [STEPS, STEPS]
+    often = replace(config.keyframes, translation_m=0.01)
+    slam = Slam(replace(config, keyframes=often), frames_wait=lambda: True)
+    assert steps_of(slam, offered[:3])[1:] == [LEAST, LEAST]
+    assert len(slam.keyframes) > 1
+    # Suddenly nothing fits any more, as in a region that was trained too little.
+    monkeypatch.setattr(Judge, "_misfit", lambda judge, alignment: "points lie off the map")
+    assert steps_of(slam, offered[3:5]) == [STEPS, STEPS]
     assert slam.state is TrackingState.DEGRADED
+    # What no keyframe shows is not trained.
+    keyframes = len(slam.keyframes)
+    for frame, odometry in offered[5:8]:
+        assert slam.process(mirrored(frame), odometry).state is TrackingState.DEGRADED
+    assert slam.tracking._untrusted == 3
     assert len(slam.keyframes) == keyframes

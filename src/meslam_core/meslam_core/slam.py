@@ -168,7 +168,10 @@ class Slam:
         if self._view is not None:
             rays = sampled.rays(self.config.tracking.points) if enough else None
             witness = partial(self._recognised, frame, rays)
-            tracked = self.tracking.track(frame.stamp_ns, self._view, rays, odometry, witness)
+            attest = partial(self._attested, frame)
+            tracked = self.tracking.track(
+                frame.stamp_ns, self._view, rays, odometry, witness, attest
+            )
             if self.tracking.lost:
                 tracked = self._sought(frame, rays, odometry) or tracked
         elif enough:
@@ -211,10 +214,11 @@ class Slam:
             # The keyframe that the pose was found by may have moved since.
             pose = self._history.keyframe_pose(pending.reference) @ pending.T_reference_camera
             is_keyframe = self._mapper.train(
-                pending.sampled, orthonormalized(pose), result.odometry
+                pending.sampled,
+                orthonormalized(pose),
+                result.odometry,
+                lags=result.state is not TrackingState.OK,
             )
-        elif self._lags(pending):
-            self._mapper.replay()
         if self.atlas is not None:
             self._remember(pending, is_keyframe)
         return replace(
@@ -223,15 +227,6 @@ class Slam:
             losses=trained.losses,
             mapping_ms=trained.duration_ms,
         )
-
-    def _lags(self, pending: _Pending) -> bool:
-        """Whether odometry leads to where a frame does not fit a map that has seen the place.
-
-        The frame must not train the map, but keyframes from before may have had too little time.
-        """
-        odometry, alignment = pending.result.odometry, pending.tracked.alignment
-        led = odometry is not None and odometry.valid
-        return led and alignment is not None and not self.tracking.lost
 
     def _remember(self, pending: _Pending, is_keyframe: bool) -> None:
         reference, relative = pending.reference, pending.T_reference_camera
@@ -303,6 +298,11 @@ class Slam:
         self._mapper.pause()
         sighting = self._mapper.relocaliser.recognise(frame, rays, before)
         return None if sighting is None else sighting.alignment.T_map_camera
+
+    def _attested(self, frame: RgbdFrame, T_map_camera: Pose) -> bool:
+        """Whether the keyframe of late shows that a frame was taken at a pose."""
+        self._mapper.pause()
+        return self._mapper.relocaliser.attests(frame, self._mapper.reference, T_map_camera)
 
     def _sought(
         self, frame: RgbdFrame, rays: Rays | None, odometry: OdometryEstimate | None

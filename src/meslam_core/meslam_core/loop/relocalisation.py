@@ -103,6 +103,24 @@ class Relocaliser:
             self._tried.append(keyframe)
         return None
 
+    def attests(self, frame: RgbdFrame, keyframe: int, T_map_camera: Pose) -> bool:
+        """Whether a keyframe's image shows that a frame was taken at a pose, whatever the map says.
+
+        Args:
+            frame: its images.
+            keyframe: number of one nearby.
+            T_map_camera: (4, 4).
+        """
+        if self._linker is None or keyframe not in self.places.keyframes:
+            return False
+        guess = inverse(self._atlas.keyframes.pose(keyframe)) @ T_map_camera
+        found = self._linker.find(keyframe, self._linker.prepare(self._linker.image(frame)), guess)
+        if found is None or not self._looks_alike(found):
+            return False
+        apart, limits = inverse(guess) @ found.T_target_source, self._config
+        near = float(np.linalg.norm(apart[:3, 3])) <= limits.agreement_m
+        return near and rotation_angle(apart) <= np.deg2rad(limits.agreement_deg)
+
     def forget(self, since: int) -> None:
         """Forget the keyframes from a number on: they were not taken where they seemed to be."""
         self.places.forget(since)

@@ -96,6 +96,8 @@ class FrameTraining:
         T_map_current: Pose,
         keyframe: NewKeyframe | None,
         revisit: Revisit | None = None,
+        *,
+        lags: bool = False,
     ) -> None:
         """Begin to train with a frame.
 
@@ -105,24 +107,18 @@ class FrameTraining:
             T_map_current: (4, 4) its pose.
             keyframe: what it is as a keyframe, where it is one.
             revisit: where it comes back to an old keyframe.
+            lags: whether the map lags behind what is seen, so that training does not give way.
         """
         config = self._optimizer.config
         steps = config.iterations if keyframe is None else config.keyframe_iterations
-        least = min(steps, config.min_iterations * self._frames_since(stamp_ns))
+        frames = self._frames_since(stamp_ns)
+        least = steps if lags else min(steps, config.min_iterations * frames)
         steps += min(self._steps_owed, MADE_UP_A_FRAME)
         self._trained = self._next_to_train()
         self._worker.start(
             partial(
                 self._train, self._trained, least, steps, current, T_map_current, keyframe, revisit
             )
-        )
-
-    def replay(self) -> None:
-        """Begin to train with keyframes alone: the map lags behind what they have seen."""
-        steps = self._optimizer.config.keyframe_iterations
-        self._trained = self._next_to_train()
-        self._worker.start(
-            partial(self._train, self._trained, steps, steps, None, None, None, None)
         )
 
     def wait(self) -> bool:
@@ -163,8 +159,8 @@ class FrameTraining:
         regions: list[Region],
         least: int,
         steps: int,
-        current: Rays | None,
-        pose: Pose | None,
+        current: Rays,
+        pose: Pose,
         keyframe: NewKeyframe | None,
         revisit: Revisit | None,
     ) -> Training:
@@ -176,10 +172,10 @@ class FrameTraining:
         # While frames wait, either a view is marked or a registration made.
         registers = self._turn % 2
         self._atlas.settle(marks=not (registers and self._frames_wait()))
-        if keyframe is not None and pose is not None:
+        if keyframe is not None:
             self._registration.add(keyframe)
             pose = self._registration.proceed(registers) @ pose
-        if revisit is not None and pose is not None:
+        if revisit is not None:
             self._registration.revisit(revisit, pose)
         losses = self._optimizer.train(
             regions[0], steps, current, pose, enough=partial(self._may_end, least)

@@ -174,9 +174,20 @@ class Mapper:
         training.start_first()
 
     def train(
-        self, sampled: SampledFrame, T_map_camera: Pose, odometry: OdometryEstimate | None
+        self,
+        sampled: SampledFrame,
+        T_map_camera: Pose,
+        odometry: OdometryEstimate | None,
+        lags: bool = False,
     ) -> bool:
-        """Update regions and keyframes for a tracked frame and train; whether it is a keyframe."""
+        """Update regions and keyframes for a tracked frame and train; whether it is a keyframe.
+
+        Args:
+            sampled: the frame.
+            T_map_camera: (4, 4) its pose.
+            odometry: of it, where there is some.
+            lags: whether the map lags behind what is seen, so that training does not give way.
+        """
         assert self.atlas is not None
         assert self._training is not None
         if not self._trains:
@@ -202,13 +213,10 @@ class Mapper:
             self._chain.cut()
         current = sampled.rays(CURRENT_FRAME_RAYS)
         self.look()
-        self._training.start(sampled.frame.stamp_ns, current, T_map_camera, keyframe, revisit)
+        self._training.start(
+            sampled.frame.stamp_ns, current, T_map_camera, keyframe, revisit, lags=lags
+        )
         return is_keyframe
-
-    def replay(self) -> None:
-        """Train with keyframes alone, as a map that lags behind them needs it."""
-        if self._training is not None and self._trains:
-            self._training.replay()
 
     def _revisited(self, frame: RgbdFrame, T_map_camera: Pose) -> int | None:
         """A keyframe from long ago that shows what a frame shows, as far as is known."""

@@ -15,7 +15,7 @@ from meslam_core.regions.region import Region
 from meslam_core.se3 import Pose, inverse, orthonormalized
 from meslam_core.tracking.field_tracker import Alignment, FieldTracker, PosePrior
 from meslam_core.tracking.frame_history import FrameHistory
-from meslam_core.tracking.judge import Judge, Verdict, Witness
+from meslam_core.tracking.judge import Attest, Judge, Verdict, Witness
 from meslam_core.tracking.plausibility import Plausibility
 from meslam_core.tracking.recovery import Recovery
 from meslam_core.tracking.sighting import Sighting
@@ -112,6 +112,7 @@ class FrameTracking:
         rays: Rays | None,
         odometry: OdometryEstimate | None,
         witness: Witness = lambda before: None,
+        attest: Attest = lambda pose: False,
     ) -> TrackedPose:
         """Find a frame's pose.
 
@@ -121,6 +122,7 @@ class FrameTracking:
             rays: of the frame, camera frame; None where it has too little depth.
             odometry: its estimate, where there is one.
             witness: tells where it was taken; asked where odometry has failed.
+            attest: tells whether it was taken at a pose; asked where only odometry leads there.
         """
         alignment = None
         verdict = Verdict(trusted=False, reason="too few pixels with depth")
@@ -130,7 +132,7 @@ class FrameTracking:
         prior = self._prior(stamp_ns, odometry)
         if rays is not None:
             alignment = self._align(region, rays, self._guesses(stamp_ns, odometry), prior)
-            verdict = self._judge.verdict(stamp_ns, region, rays, alignment, prior, witness)
+            verdict = self._judge.verdict(stamp_ns, region, rays, alignment, prior, witness, attest)
         if alignment is not None and verdict.confirmed:
             return self._confirmed(stamp_ns, alignment)
         if verdict.trusted:

@@ -17,6 +17,8 @@ from meslam_core.tracking.plausibility import Plausibility, motion_between
 # Tells where a frame was taken, T_map_camera (4, 4), by the keyframes before a number; None where
 # they do not show the place.
 Witness = Callable[[int | None], Pose | None]
+# Whether the latest keyframe's image shows that a frame was taken at T_map_camera (4, 4).
+Attest = Callable[[Pose], bool]
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class Judge:
         alignment: Alignment,
         prior: PosePrior,
         witness: Witness,
+        attest: Attest,
     ) -> Verdict:
         """Whether an alignment may be trusted, or odometry in its place."""
         path = self._path
@@ -74,7 +77,11 @@ class Judge:
         if unmapped and path.followed:
             # Beyond what is mapped only odometry knows; without it the map could not grow.
             return Verdict(trusted=True, reason=unmapped)
-        objection = unmapped or self._objection(stamp_ns, alignment, prior)
+        misfit = unmapped or self._misfit(alignment)
+        if misfit and not path.doubted and attest(prior.T_map_camera):
+            # Odometry and a keyframe agree: it is the map that lags behind.
+            return Verdict(trusted=True, reason=misfit)
+        objection = misfit or self._objection(stamp_ns, alignment, prior)
         if objection:
             return self._refused(prior, witness, objection)
         if not path.doubted:
@@ -88,15 +95,20 @@ class Judge:
             return ""
         return f"only {alignment.observed_ratio:.0%} of the view is mapped"
 
-    def _objection(self, stamp_ns: int, alignment: Alignment, prior: PosePrior) -> str:
-        """Why an alignment cannot be right; empty where it can."""
-        limits, pose = self._config, alignment.T_map_camera
-        if not np.isfinite(pose).all():
-            return "the pose is not finite"
+    def _misfit(self, alignment: Alignment) -> str:
+        """How a frame misfits the map; empty where it fits."""
+        limits = self._config
         if alignment.inlier_ratio < limits.min_inlier_ratio:
             return f"only {alignment.inlier_ratio:.0%} of the points lie on the map"
         if alignment.residual_m > limits.max_residual_m:
             return f"points lie {alignment.residual_m * 100:.1f} cm off the map"
+        return ""
+
+    def _objection(self, stamp_ns: int, alignment: Alignment, prior: PosePrior) -> str:
+        """Why a pose that fits the map cannot be right; empty where it can."""
+        pose = alignment.T_map_camera
+        if not np.isfinite(pose).all():
+            return "the pose is not finite"
         return self._path.impossible(stamp_ns, pose) or self._path.conflict(prior, pose)
 
     def _refused(self, prior: PosePrior, witness: Witness, objection: str) -> Verdict:

@@ -105,7 +105,10 @@ class MapWorker:
 
 def main() -> None:
     """Serve on the socket whose number is the program's argument, until it is closed."""
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    try:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    except OSError:  # containers may forbid it
+        os.nice(19)
     limit_threads(1, load_open3d=False)
     channel = Channel(socket.socket(fileno=int(sys.argv[1])))
     worker = MapWorker()

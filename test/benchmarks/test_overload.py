@@ -30,10 +30,10 @@ def test_stalls_come_now_and_then_and_are_the_same_for_a_seed():
 
 def test_only_poses_that_are_called_good_count_as_wrong():
     frames = [
-        overload.Frame(0, "OK", 0.1, ""),
-        overload.Frame(1, "OK", 0.3, ""),
-        overload.Frame(2, "DEGRADED", 0.5, "adrift"),
-        overload.Frame(3, "RELOCALISING", 5.0, ""),
+        overload.Frame(0, "OK", 0.3, 10.0, ""),
+        overload.Frame(1, "OK", 0.3, 1.0, ""),
+        overload.Frame(2, "DEGRADED", 0.5, 1.0, "adrift"),
+        overload.Frame(3, "RELOCALISING", 5.0, 1.0, ""),
     ]
     found = overload.summary(frames)
     assert found["wrong"] == 1

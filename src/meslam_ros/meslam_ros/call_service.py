@@ -50,7 +50,7 @@ def fill(message: Any, values: Any) -> Any:
             raise CallError(f"there is no field {name}; there are {', '.join(kinds)}")
         try:
             setattr(message, name, _value(kinds[name], value))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise CallError(f"{name} is {kinds[name]}, which {value!r} does not fit") from error
     return message
 
@@ -125,7 +125,7 @@ def request_of(kind: Any, text: str) -> Any:
     """
     try:
         values = yaml.safe_load(text) or {}
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise CallError(f"the request is no YAML: {error}") from error
     return fill(kind.Request(), values)
 

@@ -18,10 +18,17 @@ from meslam_core.frame import RgbdFrame, depth_to_metres
 from meslam_core.recordings.images import to_rgb
 from meslam_core.recordings.messages import MessageSource
 from meslam_core.recordings.pairing import ordered_pairs
-from meslam_core.recordings.playback import Playback, StreamImage, stamp_of_milliseconds
+from meslam_core.recordings.playback import (
+    Playback,
+    StreamImage,
+    check_opens,
+    stamp_of_milliseconds,
+)
 
 _STREAM_TOPIC = re.compile(r"/device_\d+/sensor_\d+/(Color|Depth)_\d+/image/")
 _TIMESTAMP = re.compile(rb"(?:^|[;\x00])timestamp=([0-9.]+)")
+
+MAX_STAMP_NS = 1 << 62
 
 _SAME_STAMP_NS = 2000
 """Stamps of index and playback agree to the rounding of a double."""
@@ -56,6 +63,7 @@ class LibrealsenseRecording:
         self._source = source
         self._topics = self._image_topics()
         self.topics = {kind: topics["data"] for kind, topics in self._topics.items()}
+        check_opens(path)
         self._calibration = Playback(path).calibration()
         self._camera = camera or self._calibration.color
 
@@ -166,6 +174,10 @@ class LibrealsenseRecording:
             # The images of a .db3 carry the time of capture, the metadata that of the camera.
             metadata = self._messages(topics.get("metadata", topics["data"]))
             stamps = [self._metadata_stamp(raw) for _, _, raw in metadata]
+        if not all(abs(stamp) <= MAX_STAMP_NS for stamp in stamps):
+            raise RecordingError(
+                f"{self.path}: a {stream} image has a stamp that is no time; record it again"
+            )
         return np.array([stamp_of_milliseconds(stamp / 1e6) for stamp in stamps], np.int64)
 
     def _messages(self, topic: str) -> Iterator[tuple[str, int, bytes]]:
@@ -173,8 +185,9 @@ class LibrealsenseRecording:
 
     def _metadata_stamp(self, raw: bytes) -> int:
         match = _TIMESTAMP.search(raw)
-        if match is None:
+        try:
+            return round(float(match[1] if match else "none") * 1e6)
+        except (ValueError, OverflowError) as error:
             raise RecordingError(
                 f"{self.path}: an image has no timestamp in its metadata; record it again"
-            )
-        return round(float(match[1]) * 1e6)
+            ) from error

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import atexit
 import queue
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -28,6 +30,26 @@ _QUEUED_FRAMES = 8
 _LENS_MODELS = {"brown_conrady": "plumb_bob", "kannala_brandt4": "equidistant"}
 
 
+PROBE_S = 120.0
+"""Opening a file takes a second, on a busy computer some more [s]."""
+_PROBE = """
+import os, sys
+import pyrealsense2 as rs
+try:
+    device = rs.context().load_device(sys.argv[1])
+    profiles = [p for sensor in device.query_sensors() for p in sensor.get_stream_profiles()]
+    images = [p for p in profiles if p.stream_type() in (rs.stream.color, rs.stream.depth)]
+    for profile in images:
+        profile.as_video_stream_profile().get_intrinsics()
+        profile.get_extrinsics_to(images[0])
+except RuntimeError as error:
+    sys.stderr.write(str(error))
+    sys.stderr.flush()
+    os._exit(1)
+os._exit(0)
+"""
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Cameras and lenses of both streams; T_color_depth (4, 4) [m]."""
@@ -48,6 +70,29 @@ class StreamImage:
     pixels: NDArray[Any] | None
     encoding: str
     depth_scale_m: float
+
+
+def check_opens(path: Path) -> None:
+    """Open a file in a process of its own: librealsense crashes on some that are damaged.
+
+    Raises:
+        RecordingError: when pyrealsense2 is not installed, or the file cannot be opened.
+    """
+    _pyrealsense2(path)
+    command = [sys.executable, "-c", _PROBE, str(path)]
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PROBE_S, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise RecordingError(f"librealsense does not come to an end with {path}") from error
+    if done.returncode:
+        told = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        reason = told if done.returncode > 0 and told else "it crashes"
+        raise RecordingError(
+            f"librealsense cannot read {path}: {reason}. The file is damaged, or newer than the "
+            "installed pyrealsense2"
+        )
 
 
 class Playback:
@@ -146,6 +191,9 @@ class Playback:
 
         def shut_down() -> None:
             ended.set()
+            # librealsense crashes when its thread reads on while the file is closed.
+            with suppress(RuntimeError):
+                self._device.as_playback().pause()
             for sensor, _ in self._sensors:
                 with suppress(RuntimeError):
                     sensor.stop()

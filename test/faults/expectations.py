@@ -55,9 +55,13 @@ def seen_of(bench: Bench, *ended: Ended, **facts: Any) -> Seen:
     for each in ended:
         if each.status != 0 or not report:
             told.append(f"exit status {each.status}")
-        told += [_short(line) for line in each.lines[-2:]]
-    words = ", ".join(told).replace(f"{bench.folder}/", "").replace(f"{bench.cache}/", "")
-    return Seen(words, {"ended": ended, **facts})
+        told += [_short(_without_places(line, bench)) for line in each.lines[-2:]]
+    return Seen(", ".join(told), {"ended": ended, **facts})
+
+
+def _without_places(text: str, bench: Bench) -> str:
+    """A text that says the same wherever it runs."""
+    return text.replace(f"{bench.folder}/", "").replace(f"{bench.cache}/", "")
 
 
 def _short(line: str) -> str:

@@ -91,8 +91,10 @@ def run_live(
 
             def final() -> bool:
                 listed = client.call(ListRegions, topics.LIST_REGIONS)
-                arrived = stamp_ns(listed.regions.header.stamp) >= last_ns and client.settled
-                return arrived and client.path_stamp_ns >= last_ns and client.regions is not None
+                heard = client.regions
+                arrived = heard is not None and stamp_ns(heard.header.stamp) >= last_ns
+                arrived = arrived and stamp_ns(listed.regions.header.stamp) >= last_ns
+                return arrived and client.settled and client.path_stamp_ns >= last_ns
 
             assert client.spin_until(final, FINAL_S), _logs(nodes)
             use(client)

@@ -14,6 +14,7 @@ import re
 import shlex
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -70,7 +71,9 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+            return result
         except MeslamError as error:
             complain(str(error))
             raise typer.Exit(BAD_INPUT) from error
@@ -78,6 +81,7 @@ class _Commands(TyperGroup):
             # Whoever reads what is printed may have gone; that is no one's error.
             if error.errno == errno.EPIPE:
                 raise
+            _forget_output()
             complain(f"the system refuses: {error}; free what it lacks and try again")
             raise typer.Exit(BAD_INPUT) from error
         except KeyboardInterrupt:
@@ -85,6 +89,12 @@ class _Commands(TyperGroup):
             complain("interrupted; what was not complete is not kept")
             # Python would wait for the threads that compute, and abort when asked once more.
             os._exit(INTERRUPTED)
+
+
+def _forget_output() -> None:
+    """Python would try once more to print at its end, and fail without a word of ours."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 app = typer.Typer(

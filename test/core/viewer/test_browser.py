@@ -83,11 +83,15 @@ def test_the_slice_of_occupancy_is_seen(page: Page, viewer: Viewer) -> None:
 def test_the_run_is_replayed(page: Page, viewer: Viewer) -> None:
     checkbox(page, "Play")
     wait_for(page, "the last image", lambda seen: count(seen, IMAGE_COLORS[1], 12) > MANY)
-    page.wait_for_function("() => !document.querySelector('input[type=checkbox]').checked")
+    for _ in range(600):
+        if len(viewer.scene.online_path.value) == FRAMES:
+            break
+        page.wait_for_timeout(100)
+    assert len(viewer.scene.online_path.value) == FRAMES
     camera = viewer.scene.camera.value
     assert camera is not None
     assert camera.T_map_camera[1, 3] == pytest.approx(0.08 * (FRAMES - 1) - 0.5)
-    assert len(viewer.scene.online_path.value) == FRAMES
+    page.wait_for_function("() => !document.querySelector('input[type=checkbox]').checked")
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])

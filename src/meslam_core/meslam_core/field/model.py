@@ -14,7 +14,7 @@ from meslam_core.field.network import FieldNetwork
 ADAM_BETAS = (0.9, 0.99)
 ADAM_EPSILON = 1e-8
 # Share of the running average that each step's weights take: it follows them by some 50 steps,
-# and Adam's noise of a step to the next, which moves the whole surface by millimetres, is gone.
+# and evens out Adam's noise, which moves the whole surface by millimetres from step to step.
 AVERAGE_SHARE = 0.02
 LUMA = (0.299, 0.587, 0.114)
 

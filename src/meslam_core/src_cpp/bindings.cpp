@@ -149,6 +149,7 @@ PYBIND11_MODULE(_kernel, module) {
     bind_rays(module, field);
     bind_rgbd(module);
     bind_observation(module);
+    bind_textures(module);
 }
 
 }  // namespace meslam

@@ -65,6 +65,9 @@ void bind_rgbd(py::module_& module);
 // Adds the marking of what rays have seen.
 void bind_observation(py::module_& module);
 
+// Adds the shading of simulated views.
+void bind_textures(py::module_& module);
+
 // Adds the training on rays and the alignment of frames.
 void bind_rays(py::module_& module, py::class_<FusedField>& field);
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from meslam_core.camera import PinholeCamera
+from meslam_core.simulation import renderer
 from meslam_core.simulation.canvas import Canvas
 from meslam_core.simulation.renderer import Renderer
 from meslam_core.simulation.scene import Lamp, Patch, Scene, box, quad
@@ -107,3 +109,87 @@ def test_lamp_casts_a_shadow():
     row = Renderer(scene).render(camera, pose).color[25, :, 0]
     x = 1.3 + (np.arange(200) - 99.5) / 50 * 0.45
     assert row[np.abs(x - 0.42).argmin()] < 0.7 * row[np.abs(x - 1.2).argmin()]
+
+
+compiled = pytest.mark.skipif(renderer._kernel is None, reason="the kernel is not compiled")
+
+
+def room_with_a_box() -> Renderer:
+    """A wall that does not fill the view, a box before it, and a floor that begins behind."""
+    floor = quad((-3.0, -2.0, -0.6), (6.0, 0, 0), (0, 6.0, 0), plaster(GREY), 0.01)
+    tiles = wall(2.0, checker((0, 0.2, 0), (1, 1, 0.7), 0.03), side=1.5, texel_m=0.002)
+    carton = box((0.3, 1.2, 0.1), (0.5, 0.3, 0.4), poster(), yaw=0.4, texel_m=0.004)
+    return Renderer(Scene("room", [tiles, floor, *carton]))
+
+
+def tilted() -> np.ndarray:
+    """A camera that looks along y, down and to the side."""
+    pose = looking_along_y()
+    pose[:3, :3] = Rotation.from_euler("zx", (12, -17), degrees=True).as_matrix() @ pose[:3, :3]
+    return pose
+
+
+@compiled
+@pytest.mark.parametrize("pose", [looking_along_y(), tilted()], ids=["straight", "tilted"])
+def test_compiled_views_are_those_of_cast_rays(pose, monkeypatch: pytest.MonkeyPatch):
+    room = room_with_a_box()
+    view = room.render(CAMERA, pose)
+    monkeypatch.setattr(renderer, "_kernel", None)
+    reference = room.render(CAMERA, pose)
+    assert (reference.depth_m == 0).any()
+    # Another triangle at the outline of something is a rounding error away.
+    same = np.abs(view.depth_m - reference.depth_m) < 1e-4
+    assert same.mean() > 0.999
+    np.testing.assert_allclose(view.incidence[same], reference.incidence[same], atol=1e-4)
+    differs = np.abs(view.color - reference.color).max(axis=2)
+    assert np.median(differs) < 1e-3
+    assert np.mean(differs > 3) < 0.005
+
+
+@compiled
+def test_compiled_shading_is_that_of_numpy(monkeypatch: pytest.MonkeyPatch):
+    room = room_with_a_box()
+    hits = room._seen(CAMERA, tilted())
+    colors = room._shade(hits, CAMERA)
+    monkeypatch.setattr(renderer, "_kernel", None)
+    reference = room._shade(hits, CAMERA)
+    assert np.unique(reference.round()).size > 50
+    np.testing.assert_allclose(colors, reference, atol=1e-3)
+
+
+@compiled
+def test_a_triangle_behind_beside_or_without_area_is_not_seen():
+    behind = [[-1, -1, -2], [1, -1, -2], [0, 1, -2]]
+    beside = [[9, -1, 2], [10, -1, 2], [9, 1, 2]]
+    line = [[-1, -1, 2], [0, 0, 2], [1, 1, 2]]
+    corners = np.array([behind, beside, line], float)
+    camera = {"width": 64, "height": 48, "fx": 60.0, "fy": 62.0, "cx": 31.0, "cy": 24.5}
+    depth, _, _, cosine = renderer._kernel.seen_triangles(corners, **camera)
+    assert np.isinf(depth).all()
+    assert not cosine.any()
+
+
+@compiled
+def test_compiled_shading_refuses_what_would_lead_beyond_its_arrays():
+    arrays = {
+        "image": np.zeros((4, 4, 3), np.uint8),
+        "levels": np.ones((3, 2), np.float32),
+        "texels": np.ones((5, 7), np.float32),
+        "distance": np.ones(1, np.float32),
+        "triangle": np.array([4], np.uint32),
+        "shares": np.full((1, 2), 1e9, np.float32),
+        "cosine": np.ones(1, np.float32),
+    }
+    assert renderer._kernel.shade(**arrays, focal_px=1.0).shape == (1, 3)
+    wrong = {
+        "image": np.zeros((1, 4, 3), np.uint8),
+        "levels": np.ones((2, 2), np.float32),
+        "texels": np.ones((5, 6), np.float32),
+        "distance": np.ones(2, np.float32),
+        "triangle": np.array([5], np.uint32),
+        "shares": np.ones((1, 3), np.float32),
+        "cosine": np.ones(2, np.float32),
+    }
+    for name, array in wrong.items():
+        with pytest.raises(ValueError, match=r".+"):
+            renderer._kernel.shade(**{**arrays, name: array}, focal_px=1.0)

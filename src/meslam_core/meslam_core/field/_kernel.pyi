@@ -139,3 +139,23 @@ def align_rgbd(
     luma_bias_m: float,
     luma_bias_rad: float,
 ) -> dict[str, Any]: ...
+def shade(
+    image: NDArray[np.uint8],
+    levels: _Floats,
+    texels: _Floats,
+    distance: _Floats,
+    triangle: NDArray[np.uint32],
+    shares: _Floats,
+    cosine: _Floats,
+    focal_px: float,
+) -> _Floats: ...
+def seen_triangles(
+    corners: _Doubles,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> tuple[_Floats, NDArray[np.uint32], _Floats, _Floats]: ...

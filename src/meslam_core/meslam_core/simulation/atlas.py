@@ -84,6 +84,10 @@ class Atlas:
         layout: see `lay_out`.
         irradiance: for each patch (n, m) light on a grid over it, 1 shows the paint as it is.
         seed: of everything random in the textures.
+
+    Attributes:
+        image: (H, W, 3) uint8, all levels.
+        levels: (3, LEVELS) float32: a level's scale, and its shift in columns and rows [px].
     """
 
     def __init__(
@@ -94,7 +98,7 @@ class Atlas:
         seed: int,
     ) -> None:
         # The coarser levels lie side by side below the finest.
-        self._image = np.zeros((layout.height + layout.height // 2, layout.width, 3), np.uint8)
+        self.image = np.zeros((layout.height + layout.height // 2, layout.width, 3), np.uint8)
         with ThreadPoolExecutor(PAINT_THREADS) as pool:
             list(
                 pool.map(
@@ -107,16 +111,16 @@ class Atlas:
                 )
             )
         corners = np.zeros((LEVELS, 2))
-        level, left = self._image[: layout.height], 0
+        level, left = self.image[: layout.height], 0
         for index in range(1, LEVELS):
             half = (level.shape[1] // 2, level.shape[0] // 2)
             level = np.asarray(cv2.resize(level, half, interpolation=cv2.INTER_AREA), np.uint8)
-            self._image[layout.height : layout.height + half[1], left : left + half[0]] = level
+            self.image[layout.height : layout.height + half[1], left : left + half[0]] = level
             corners[index] = (left, layout.height)
             left += half[0]
         scales = 0.5 ** np.arange(LEVELS)
         shifts = corners.T + 0.5 * scales - 0.5
-        self._levels = np.concatenate([scales[None], shifts]).astype(np.float32)
+        self.levels = np.concatenate([scales[None], shifts]).astype(np.float32, order="C")
 
     def _paint(
         self, layout: Layout, seed: int, index: int, patch: Patch, light: NDArray[np.float32]
@@ -130,7 +134,7 @@ class Atlas:
         lit = np.clip(painted * (255 * shade[..., None]) + 0.5, 0, 255).astype(np.uint8)
         lit = np.pad(lit, ((GUTTER, GUTTER), (GUTTER, GUTTER), (0, 0)), mode="edge")
         left, top = layout.corners[index] - GUTTER
-        self._image[top : top + lit.shape[0], left : left + lit.shape[1]] = lit
+        self.image[top : top + lit.shape[0], left : left + lit.shape[1]] = lit
 
     def lookup(
         self,
@@ -157,14 +161,14 @@ class Atlas:
         self, x: NDArray[np.float32], y: NDArray[np.float32], level: NDArray[np.int32]
     ) -> NDArray[np.float32]:
         # (x + 0.5) * scale - 0.5 + corner, with all constants in one table.
-        scale, left, top = self._levels.take(level, axis=1)
+        scale, left, top = self.levels.take(level, axis=1)
         count = len(x)
         rows = -(-count // LOOKUP_ROW)
         maps = np.zeros((2, rows * LOOKUP_ROW), np.float32)
         np.add(x * scale, left, out=maps[0, :count])
         np.add(y * scale, top, out=maps[1, :count])
         map_x, map_y = maps.reshape(2, rows, LOOKUP_ROW)
-        colors = cv2.remap(self._image, map_x, map_y, cv2.INTER_LINEAR)
+        colors = cv2.remap(self.image, map_x, map_y, cv2.INTER_LINEAR)
         return colors.reshape(-1, 3)[:count].astype(np.float32)
 
 

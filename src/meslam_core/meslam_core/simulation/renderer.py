@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -14,6 +16,11 @@ from meslam_core.se3 import Pose
 from meslam_core.simulation.atlas import Atlas, lay_out
 from meslam_core.simulation.lighting import bake
 from meslam_core.simulation.scene import Scene
+
+# Without the kernel numpy and cast rays give the same views, more slowly.
+_kernel: Any = None
+with contextlib.suppress(ImportError):
+    from meslam_core.field import _kernel
 
 EDGE_SAMPLES = np.array([(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375)])
 """Offsets of the extra rays of a pixel on an edge [px], a rotated grid."""
@@ -48,7 +55,7 @@ class _Hits:
 
 
 class Renderer:
-    """Renders a scene by casting rays at its triangles and looking its textures up.
+    """Renders a scene: which triangles are seen where, and their textures.
 
     Args:
         scene: what to render.
@@ -58,6 +65,7 @@ class Renderer:
 
     def __init__(self, scene: Scene, texel_scale: float = 1.0, seed: int = 0) -> None:
         self.surface = scene_surface(scene)
+        self._corners = np.asarray(self.surface.vertices)[np.asarray(self.surface.triangles)]
         self._caster = o3d.t.geometry.RaycastingScene()
         self._caster.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(self.surface))
         layout = lay_out(scene.patches, texel_scale)
@@ -72,7 +80,7 @@ class Renderer:
         # Rows: atlas position of a triangle's first corner, its two edges, its texels' length.
         self._texels = np.concatenate(
             [corners[:, 0], edges[:, 0], edges[:, 1], np.concatenate(texel_m)[:, None]], axis=1
-        ).T.copy()
+        )
         self._patch_of = np.concatenate(patch_of)
         self._atlas = Atlas(scene.patches, layout, bake(scene, self._caster), seed)
 
@@ -82,7 +90,7 @@ class Renderer:
         Colour is filtered over each pixel's footprint and, where a pixel holds an edge, averaged
         over several rays; depth is that of the pixel's centre.
         """
-        hits = self._cast(*_image_rays(camera), T_map_camera)
+        hits = self._seen(camera, T_map_camera)
         color = self._shade(hits, camera)
         size = (camera.height, camera.width)
         seen = np.isfinite(hits.distance)
@@ -101,14 +109,24 @@ class Renderer:
             color[rows * camera.width + columns] = mean
         return View(color.reshape(*size, 3), depth, hits.incidence.reshape(size))
 
+    def _seen(self, camera: PinholeCamera, T_map_camera: Pose) -> _Hits:
+        """What the pixels' centres see, row by row."""
+        if _kernel is None:
+            return self._cast(*_image_rays(camera), T_map_camera)
+        corners = (self._corners - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
+        intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        return _Hits(
+            *_kernel.seen_triangles(corners, width=camera.width, height=camera.height, **intrinsics)
+        )
+
     def _cast(
         self, directions: NDArray[np.float32], lengths: NDArray[np.float32], T_map_camera: Pose
     ) -> _Hits:
         """Cast rays of camera-frame directions (N, 3) and their lengths (N,) from the camera."""
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3] = T_map_camera[:3, 3]
-        turned = directions @ T_map_camera[:3, :3].T.astype(np.float32)
-        rays[:, 3:] = turned
+        turned = rays[:, 3:]
+        np.matmul(directions, T_map_camera[:3, :3].T.astype(np.float32), out=turned)
         answer = self._caster.cast_rays(o3d.core.Tensor.from_numpy(rays))
         normals = answer["primitive_normals"].numpy()
         cosine = np.abs(np.einsum("ij,ij->i", normals, turned))
@@ -122,6 +140,19 @@ class Renderer:
 
     def _shade(self, hits: _Hits, camera: PinholeCamera) -> NDArray[np.float32]:
         """Colours (N, 3) in [0, 255] at the rays' ends, black where there is none."""
+        if _kernel is not None:
+            return np.asarray(
+                _kernel.shade(
+                    self._atlas.image,
+                    self._atlas.levels,
+                    self._texels,
+                    distance=hits.distance,
+                    triangle=hits.triangle,
+                    shares=hits.shares,
+                    cosine=hits.incidence,
+                    focal_px=camera.fx,
+                )
+            )
         color = np.empty((len(hits.distance), 3), np.float32)
         # In blocks, because the intermediate arrays of a whole image leave the cache.
         for first in range(0, len(color), SHADE_BLOCK):
@@ -129,7 +160,7 @@ class Renderer:
             distance, triangle = hits.distance[block], hits.triangle[block]
             seen = np.isfinite(distance)
             triangle = np.where(seen, triangle, 0)
-            shares, table = hits.shares[block], self._texels.take(triangle, axis=1)
+            shares, table = hits.shares[block], self._texels[triangle].T
             x = table[0] + shares[:, 0] * table[2] + shares[:, 1] * table[4]
             y = table[1] + shares[:, 0] * table[3] + shares[:, 1] * table[5]
             # Between the footprint's short and long axis: neither shimmering nor washed out.

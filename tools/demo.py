@@ -47,6 +47,7 @@ from meslam_interfaces.srv import ExportMap, ListRegions, SaveMap
 from meslam_ros import topics
 from meslam_ros.client import MeslamClient
 from meslam_ros.conversions import stamp_ns
+from meslam_ros.domains import free_domain
 from meslam_ros.node_settings import PlayerSettings
 from meslam_ros.processes import NodeProcess, ros_arguments
 
@@ -280,7 +281,7 @@ def _tail(process: NodeProcess) -> str:
 def _own_domain() -> None:
     """Keep to this computer, and out of the way of other systems on it."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    os.environ.setdefault("ROS_DOMAIN_ID", str(free_domain(os.getpid())))
 
 
 def _progress(console: Console) -> Progress:

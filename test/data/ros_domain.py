@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from meslam_ros.domains import LAST_DOMAIN, taken_domains
 
-SHARED_MEMORY = Path("/dev/shm")
-PORT_FILE = "fastrtps_port"
-FIRST_PORT, PORTS_A_DOMAIN = 7400, 250
-# Domains above 101 may collide with the ports that Linux hands out to other programs.
-PAIRS = 50
+PAIRS = LAST_DOMAIN // 2
 
 
 def _two_domains() -> tuple[int, int]:
-    """Two domains in whose shared-memory ports no process sits, nor one that was killed.
-
-    Fast DDS does not always notice that a port's owner is gone; whoever gets that port then hears
-    nothing.
-    """
-    ports = [file.name.removeprefix(PORT_FILE) for file in SHARED_MEMORY.glob(f"{PORT_FILE}*")]
-    taken = {(int(port) - FIRST_PORT) // PORTS_A_DOMAIN for port in ports if port.isdigit()}
+    """Two domains that nobody uses."""
+    taken = taken_domains()
     first = os.getpid() % PAIRS
     pairs = [(1 + 2 * ((first + n) % PAIRS), 2 + 2 * ((first + n) % PAIRS)) for n in range(PAIRS)]
     return next((pair for pair in pairs if not taken.intersection(pair)), pairs[0])

@@ -9,8 +9,6 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.qos import ReliabilityPolicy
-from rclpy.serialization import deserialize_message
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image
 
 from meslam_core.errors import FrameError
@@ -23,6 +21,7 @@ from meslam_ros import topics
 from meslam_ros.conversions import color_image
 from meslam_ros.diagnostics import DIAGNOSTICS_PERIOD_S, OK, STALE, Diagnostics
 from meslam_ros.live_scene import LiveScene
+from meslam_ros.looked_up import LookedUpTopic
 from meslam_ros.managed_node import ManagedNode, run
 from meslam_ros.node_settings import FrameSettings
 from meslam_ros.parameters import declare_settings
@@ -32,7 +31,8 @@ from meslam_ros.transforms import BaseFrame, StaticTransforms
 from meslam_ros.viewer_settings import ViewerSettings
 
 NICENESS = 10
-IMAGE_PERIOD_S = 0.08
+CAMERA_PERIOD_S = 0.07
+IMAGE_PERIOD_S = 0.14
 PATH_PERIOD_S = 1.0
 # Nobody waits for a viewer: lost images are not sent again.
 BEST_EFFORT = images(ReliabilityPolicy.BEST_EFFORT, 1)
@@ -62,16 +62,15 @@ class ViewerNode(ManagedNode):
         self.get_logger().info(f"the map is shown on {self._viewer.page.url}")
 
     def activate(self) -> None:
-        subscribe, live = self.create_subscription, self._live
-        self._always = [
-            subscribe(TrackingStatus, topics.STATUS, live.take_status, STREAM),
-            subscribe(PoseStamped, topics.POSE, self._take_pose, STREAM),
-            subscribe(RegionModel, topics.REGION_MODELS, live.take_model, latched(MODELS_DEPTH)),
-            subscribe(CameraInfo, topics.COLOR_INFO, self._take_info, BEST_EFFORT),
-        ]
-        self._watched: list[Subscription] = []
-        self._latest: dict[type, bytes] = {}
+        self._models = self.create_subscription(
+            RegionModel, topics.REGION_MODELS, self._live.take_model, latched(MODELS_DEPTH)
+        )
+        self._status = LookedUpTopic(self, TrackingStatus, topics.STATUS, STREAM)
+        self._pose = LookedUpTopic(self, PoseStamped, topics.POSE, STREAM)
+        self._info = LookedUpTopic(self, CameraInfo, topics.COLOR_INFO, BEST_EFFORT)
+        self._watched: tuple[LookedUpTopic, LookedUpTopic] | None = None
         self._clocks = [
+            self.create_timer(CAMERA_PERIOD_S, self._show_camera, clock=STEADY),
             self.create_timer(IMAGE_PERIOD_S, self._show_image, clock=STEADY),
             self.create_timer(PATH_PERIOD_S, self._show_path, clock=STEADY),
             self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=STEADY),
@@ -80,8 +79,9 @@ class ViewerNode(ManagedNode):
     def deactivate(self) -> None:
         for timer in self._clocks:
             self.destroy_timer(timer)
-        for subscription in (*self._always, *self._watched):
-            self.destroy_subscription(subscription)
+        self.destroy_subscription(self._models)
+        for topic in (self._status, self._pose, self._info, *(self._watched or ())):
+            topic.close()
 
     def cleanup(self) -> None:
         self._diagnostics.close()
@@ -94,29 +94,30 @@ class ViewerNode(ManagedNode):
         Not before tracking has begun: a player waits until so many listen, and means others.
         """
         wanted = self._viewer.page.viewers > 0 and self._live.begun
-        if wanted and not self._watched:
-            # Serialised: most images and paths are never looked at.
-            self._watched = [
-                self.create_subscription(kind, name, self._keep(kind), profile, raw=True)
-                for kind, name, profile in (
-                    (Image, topics.COLOR, BEST_EFFORT),
-                    (Path, topics.PATH, latched()),
-                )
-            ]
-        elif not wanted and self._watched:
-            for subscription in self._watched:
-                self.destroy_subscription(subscription)
-            self._watched = []
+        if wanted and self._watched is None:
+            self._watched = (
+                LookedUpTopic(self, Image, topics.COLOR, BEST_EFFORT),
+                LookedUpTopic(self, Path, topics.PATH, latched()),
+            )
+        elif not wanted and self._watched is not None:
+            for topic in self._watched:
+                topic.close()
+            self._watched = None
 
-    def _keep(self, kind: type) -> Any:
-        return lambda data: self._latest.__setitem__(kind, data)
+    def _show_camera(self) -> None:
+        for status in self._status.news():
+            self._live.take_status(status)
+        for pose in self._pose.news():
+            self._take_pose(pose)
 
     def _show_image(self) -> None:
         self._follow_viewers()
-        if (data := self._latest.pop(Image, None)) is None:
+        if (info := self._info.newest()) is not None:
+            self._take_info(info)
+        if self._watched is None or (message := self._watched[0].newest()) is None:
             return
         try:
-            image = color_image(deserialize_message(data, Image), topics.COLOR)
+            image = color_image(message, topics.COLOR)
         except FrameError as error:
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
@@ -124,8 +125,8 @@ class ViewerNode(ManagedNode):
 
     def _show_path(self) -> None:
         self._live.notice_silence()
-        if (data := self._latest.pop(Path, None)) is not None:
-            self._live.take_path(deserialize_message(data, Path))
+        if self._watched is not None and (path := self._watched[1].newest()) is not None:
+            self._live.take_path(path)
 
     def _take_pose(self, message: PoseStamped) -> None:
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from meslam_core.errors import MapError
-from meslam_core.map.lattice import cell_numbers, numbered_cells, unique_cells
+from meslam_core.map.lattice import cell_numbers, true_cells, unique_cells
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.map.triangle_mesh import TriangleMesh, without_shards
@@ -27,7 +27,6 @@ MAX_REFINEMENT_VOXELS = 0.5
 MIN_SHARD_M2 = 0.01
 
 Progress = Callable[[int, int], None]
-Block = tuple[int, int, int]
 
 
 def extract_mesh(
@@ -64,8 +63,8 @@ def extract_mesh(
     chosen = neural_map.regions if regions is None else neural_map.subset(regions)
     tiles = _tiles(_near_blocks(neural_map, chosen, resolution, box))
     builder = _Builder(neural_map, chosen, resolution)
-    for number, (tile, blocks) in enumerate(sorted(tiles.items())):
-        builder.add(tile, blocks)
+    for number, blocks in enumerate(tiles):
+        builder.add(blocks)
         if progress is not None:
             progress(number + 1, len(tiles))
     mesh = _seen_from_front(builder.mesh(), neural_map)
@@ -118,23 +117,18 @@ def _near_blocks(
     return blocks
 
 
-def _tiles(blocks: NDArray[np.int64]) -> dict[Block, NDArray[np.int64]]:
+def _tiles(blocks: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Blocks (N, 3) by the tile they belong to."""
-    if not len(blocks):
-        return {}
     numbers = cell_numbers(blocks // TILE_BLOCKS)
-    return {
-        (int(x), int(y), int(z)): blocks[numbers == number]
-        for number in np.unique(numbers)
-        for x, y, z in numbered_cells(number[None])
-    }
+    return [blocks[numbers == number] for number in np.unique(numbers)]
 
 
 class _Builder:
     """Runs marching cubes tile by tile and joins the tiles' meshes.
 
     Tiles share the lattice points on their faces, so that a vertex on a face is found by both
-    tiles on the same lattice edge, which joins them.
+    tiles on the same lattice edge, which joins them. Where the box that holds a tile's blocks is
+    smaller than the tile, nothing is shared.
     """
 
     def __init__(
@@ -150,11 +144,12 @@ class _Builder:
         self._parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]] = []
         self._count = 0
 
-    def add(self, tile: Block, blocks: NDArray[np.int64]) -> None:
-        """March through the blocks of one tile."""
-        first = np.array(tile) * (TILE_BLOCKS * BLOCK)
-        wanted = np.zeros((TILE_BLOCKS,) * 3, bool)
-        wanted[tuple((blocks - np.array(tile) * TILE_BLOCKS).T)] = True
+    def add(self, blocks: NDArray[np.int64]) -> None:
+        """March through the blocks (N, 3) of one tile, in the box that holds them."""
+        lowest = blocks.min(axis=0)
+        first = lowest * BLOCK
+        wanted = np.zeros(blocks.max(axis=0) - lowest + 1, bool)
+        wanted[tuple((blocks - lowest).T)] = True
         cells = _enlarged(wanted, BLOCK // COARSE)
         if 2 * COARSE * self._resolution <= self._mask_voxel_m:
             cells = self._crossed(self._evaluate(cells, first, COARSE), cells)
@@ -165,7 +160,7 @@ class _Builder:
     def _evaluate(
         self, cells: NDArray[np.bool_], first: NDArray[np.int64], stride: int
     ) -> NDArray[np.float32]:
-        """f over the surface level at the corners (n + 1,)^3 of cells (n,)^3.
+        """f over the surface level at the corners (a + 1, b + 1, c + 1) of cells (a, b, c).
 
         NaN where nothing was seen near a surface, or no cell asks.
 
@@ -174,11 +169,10 @@ class _Builder:
             first: (3,) lattice point of the lowest corner.
             stride: lattice steps from corner to corner.
         """
-        side = cells.shape[0]
-        corners = np.zeros((side + 1,) * 3, bool)
-        for step in product((0, 1), repeat=3):
-            corners[tuple(slice(s, s + side) for s in step)] |= cells
-        lattice = np.argwhere(corners)
+        corners = np.zeros([side + 1 for side in cells.shape], bool)
+        for corner in _corners(cells.shape):
+            corners[corner] |= cells
+        lattice = true_cells(corners)
         points = (lattice * stride + first) * self._resolution
         answer = self._map.values(points, near_only=True)
         values = answer.distance - np.float32(self._map.surface_level)
@@ -195,14 +189,12 @@ class _Builder:
         No point of a cell is farther from a corner than half its diagonal; where every corner
         is farther than that from the surface, on one side of it, the cell holds none.
         """
-        side = cells.shape[0]
         reach_m = 0.5 * np.sqrt(3.0) * COARSE * self._resolution * MAX_SLOPE
         reach = np.float32(reach_m / self._map.truncation_m)
         before, behind = np.zeros_like(cells), np.zeros_like(cells)
-        for step in product((0, 1), repeat=3):
-            corner = field[tuple(slice(s, s + side) for s in step)]
-            before |= corner < reach
-            behind |= corner > -reach
+        for corner in _corners(cells.shape):
+            before |= field[corner] < reach
+            behind |= field[corner] > -reach
         crossed: NDArray[np.bool_] = cells & before & behind
         return crossed
 
@@ -221,8 +213,8 @@ class _Builder:
     ) -> None:
         """Triangles of the cells whose corners are all known."""
         known = np.isfinite(field)
-        for step in product((0, 1), repeat=3):
-            cells = cells & known[tuple(slice(s, s + cells.shape[0]) for s in step)]
+        for corner in _corners(cells.shape):
+            cells = cells & known[corner]
         field = np.where(known, field, np.float32(-1.0))
         # skimage asks for a cell at its upper corner.
         mask = np.zeros(field.shape, bool)
@@ -236,7 +228,7 @@ class _Builder:
         except (ValueError, RuntimeError):  # no cell holds a surface
             return
         vertices = vertices.astype(np.float64)
-        shared = np.flatnonzero(_on_face(vertices, field.shape[0] - 1))
+        shared = np.flatnonzero(_on_face(vertices, cells.shape))
         edges = _edge_numbers(vertices[shared], first)
         self._shared.append(np.stack([edges, shared + self._count]))
         # skimage winds them clockwise seen from the lower values, which are free space.
@@ -279,16 +271,22 @@ class _Builder:
         return TriangleMesh(vertices, triangles, normals, colors).selected(proper)
 
 
+def _corners(shape: tuple[int, ...]) -> Iterator[tuple[slice, ...]]:
+    """The lattice points at each of the eight corners of all cells of a box."""
+    for step in product((0, 1), repeat=3):
+        yield tuple(slice(s, s + side) for s, side in zip(step, shape, strict=True))
+
+
 def _enlarged(cells: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
-    """Every cell (n,)^3 as factor^3 cells."""
+    """Every cell (a, b, c) as factor^3 cells."""
     result: NDArray[np.bool_] = cells.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)
     return result
 
 
-def _on_face(vertices: NDArray[np.float64], side: int) -> NDArray[np.bool_]:
-    """Which vertices (V, 3) of a tile lie on its faces, where other tiles have them too."""
+def _on_face(vertices: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which vertices (V, 3) of a box lie on its faces, where other boxes have them too."""
     margin = 0.25 * MIN_MARGIN
-    outermost = (vertices < margin) | (vertices > side - margin)
+    outermost = (vertices < margin) | (vertices > np.array(shape) - margin)
     return np.asarray(outermost.any(axis=1), np.bool_)
 
 

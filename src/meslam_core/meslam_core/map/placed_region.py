@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meslam_core.field.model import FieldModel
+from meslam_core.map.lattice import true_cells
 from meslam_core.map.stored_region import StoredRegion
 from meslam_core.regions.observed_mask import NEAR_SURFACE, OBSERVED
 
@@ -52,7 +53,7 @@ class PlacedRegion:
     def observed_centers(self, near_surface: bool = False) -> NDArray[np.float64]:
         """Centres (N, 3) of the voxels observed, or of those near a surface, map frame [m]."""
         mask = self.stored.mask
-        voxels = np.argwhere(mask.flags & (NEAR_SURFACE if near_surface else OBSERVED))
+        voxels = true_cells(mask.flags & (NEAR_SURFACE if near_surface else OBSERVED))
         local = (voxels + 0.5) * mask.voxel_m - mask.half_extent_m
         centers: NDArray[np.float64] = local @ self.rotation.T + self.center
         return centers

@@ -24,6 +24,7 @@ from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.occupancy import occupancy_grid
 from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.regions.grid import RegionIndex
+from meslam_core.regions.observed_mask import NEAR_SURFACE
 from meslam_core.threads import limit_threads
 from meslam_core.viewer.channel import Channel
 
@@ -95,7 +96,7 @@ class MapWorker:
         near_m3 = 0.0
         for region in neural_map.regions:
             mask = region.stored.mask
-            near_m3 += len(region.observed_centers(near_surface=True)) * mask.voxel_m**3
+            near_m3 += np.count_nonzero(mask.flags & NEAR_SURFACE) * mask.voxel_m**3
         if near_m3 / resolution_m**3 > MAX_MESH_CELLS:
             raise MapError(
                 f"a mesh of {resolution_m} m is too fine for this map; choose a coarser one"

@@ -116,13 +116,24 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     results = compared(options.recording, options.seeds, options.frames)
-    console = Console()
-    console.print(machine_line(machine(LIBRARIES)))
-    console.print(table(results, "map_error_m", "Error of a new region's map [cm]"))
-    console.print(table(results, "pose_error_m", "Error of the motion since the switch [cm]"))
+    described, console = machine(LIBRARIES), Console(width=100, markup=False)
+    tables = [
+        table(results, "map_error_m", "Error of a new region's map [cm]"),
+        table(results, "pose_error_m", "Error of the motion since the switch [cm]"),
+    ]
+    console.print(*tables)
     options.out.mkdir(parents=True, exist_ok=True)
+    seeds = " ".join(map(str, options.seeds))
+    part = "" if options.frames is None else f" --frames {options.frames}"
+    command = f"python benchmarks/continuation.py {options.recording.name}{part} --seeds {seeds}"
+    with (options.out / "continuation.txt").open("w") as file:
+        regions = ", ".join(f"{each['regions']} {how}" for how, each in results.items())
+        file.write(f"Made by `{command}`\n\n{machine_line(described)}\n")
+        file.write(f"Medians over new regions: {regions}\n\n")
+        Console(file=file, width=100, markup=False).print(*tables)
     written = {
-        "machine": machine(LIBRARIES),
+        "command": command,
+        "machine": described,
         "recording": options.recording.name,
         "results": results,
     }

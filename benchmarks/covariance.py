@@ -269,8 +269,8 @@ def write(
     table, words = table_of(results), verdict(results)
     with stem.with_suffix(".txt").open("w") as file:
         file.write(f"Made by `{command}`\n\n{machine_line(described)}\n{words}\n")
-        Console(file=file, width=170).print(table)
-    Console(width=170).print(table)
+        Console(file=file, width=170, markup=False).print(table)
+    Console(width=170, markup=False).print(table)
     print(words)
     content = {"command": command, "machine": described, "results": results}
     stem.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n")

@@ -304,7 +304,7 @@ def plot(timings: Sequence[Timing], path: Path) -> None:
 
 def write_table(table: Table, ratios: dict[str, float], path: Path) -> None:
     with path.open("w") as file:
-        console = Console(file=file, width=140)
+        console = Console(file=file, width=140, markup=False)
         file.write("Made by `python benchmarks/kernel_throughput.py`\n\n")
         file.write(f"{machine()}\n\n")
         console.print(table)
@@ -325,7 +325,7 @@ def main() -> None:
     timings = measure_in_processes(options.rounds, options.seconds)
     ratios = speedups(timings)
     table = table_of(timings)
-    console = Console()
+    console = Console(markup=False)
     console.print(table)
     for name, ratio in ratios.items():
         console.print(f"{name}: {ratio:.1f}")

@@ -234,7 +234,7 @@ def write(
     """The table, JSON and plot."""
     names = {key: method.name for key, method in METHODS.items()}
     shown = tables(summary, names)
-    console = Console(width=150)
+    console = Console(width=150, markup=False)
     options.out.mkdir(parents=True, exist_ok=True)
     stem = options.out / ("large_scene_quick" if options.quick else "large_scene")
     described = machine(LIBRARIES)
@@ -243,7 +243,7 @@ def write(
         file.write(f"Made by `{command}`\n\n{machine_line(described)}\n{options.note}\n")
         for table in shown:
             console.print(table)
-            Console(file=file, width=150).print(table)
+            Console(file=file, width=150, markup=False).print(table)
     result = {
         "command": command,
         "machine": described,

@@ -350,14 +350,14 @@ def main() -> None:
     settings = [*LIGHTER, *options.set]
     samples = measure(driven_round(options.scene), options.minutes, options.every, settings)
     found, described = verdict(samples), machine(LIBRARIES)
-    Console(width=140).print(table_of(samples), sentence(found))
+    Console(width=140, markup=False).print(table_of(samples), sentence(found))
     options.out.mkdir(parents=True, exist_ok=True)
     stem = options.out / "long_run"
     with stem.with_suffix(".txt").open("w") as file:
         command = f"python benchmarks/long_run.py --scene {options.scene}"
         file.write(f"Made by `{command} --minutes {options.minutes:g}`\n\n")
         file.write(f"{machine_line(described)}\n\n")
-        Console(file=file, width=140).print(table_of(samples))
+        Console(file=file, width=140, markup=False).print(table_of(samples))
         file.write(sentence(found) + "\n")
     plot(samples, stem.with_suffix(".png"))
     names = [field.name for field in fields(Sample) if field.name != "told"]

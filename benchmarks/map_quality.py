@@ -589,7 +589,7 @@ def main() -> None:
     if not chosen:
         parser.error("there is no such recording; set MESLAM_DATA, or make the demo's (make demo)")
     config = MeslamConfig.from_overrides(options.set)
-    console = Console()
+    console = Console(markup=False)
     found: list[Score] = []
     for source in chosen:
         found += measure(source, config, options.budgets, options.seeds)
@@ -603,7 +603,7 @@ def main() -> None:
         command = " ".join(["python", "benchmarks/map_quality.py", *sys.argv[1:]])
         file.write(f"Made by `{command}`, on one thread\n\n")
         file.write(f"{machine_line(described)}\n\n")
-        Console(file=file, width=150).print(table_of(found))
+        Console(file=file, width=150, markup=False).print(table_of(found))
         for each in found:
             if not each.steps:
                 file.write(f"{each.scene}, {each.method}: {each.settings}\n")

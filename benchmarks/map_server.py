@@ -298,7 +298,7 @@ def main() -> None:
         options.scene, CACHE / f"{name}.mcap", "--duration", str(options.duration)
     )
     results = measure(recording, options.duration, options.repeats)
-    console = Console(width=160, record=True)
+    console = Console(width=160, markup=False, record=True)
     console.print(machine_line(machine(LIBRARIES)))
     console.print(f"meslam simulate {options.scene} --duration {options.duration:g}")
     console.print(table(results))

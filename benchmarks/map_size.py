@@ -284,7 +284,7 @@ def main() -> None:
         "note": options.note,
     }
     stem = options.out / ("map_size_quick" if options.quick else "map_size")
-    write_results(rows, result, stem, Console(width=160))
+    write_results(rows, result, stem, Console(width=160, markup=False))
 
 
 if __name__ == "__main__":

@@ -179,7 +179,7 @@ def write_results(rows: Sequence[Row], head: dict[str, Any], stem: Path, console
     with stem.with_suffix(".txt").open("w") as file:
         file.write(f"Made by `{head['command']}`\n\n{machine_line(head['machine'])}\n")
         file.write(f"{head['note']}\n")
-        Console(file=file, width=160).print(table_of(rows))
+        Console(file=file, width=160, markup=False).print(table_of(rows))
         file.write("\n" + "\n".join(verdicts(rows)) + "\n")
     result = {**head, "rows": [asdict(each) for each in rows]}
     stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")

@@ -304,7 +304,7 @@ def main() -> None:
     found = summary(samples)
     described = machine(LIBRARIES)
     table = table_of(samples, found)
-    console = Console()
+    console = Console(markup=False)
     console.print(table)
     console.print(verdict(found))
     options.out.mkdir(parents=True, exist_ok=True)
@@ -312,7 +312,7 @@ def main() -> None:
     with stem.with_suffix(".txt").open("w") as file:
         command = f"python benchmarks/memory.py --minutes {options.minutes:g}"
         file.write(f"Made by `{command}` on {path.name}\n\n{machine_line(described)}\n\n")
-        Console(file=file, width=120).print(table)
+        Console(file=file, width=120, markup=False).print(table)
         file.write(verdict(found) + "\n")
     plot(samples, found, stem.with_suffix(".png"))
     result = {

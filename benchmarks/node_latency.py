@@ -326,7 +326,7 @@ def main() -> int:
     truth_file = Path(data) / RECORDING / "groundtruth.txt"
     mcap = mcap_of(Path(data) / RECORDING)
     truth = read_tum(truth_file)
-    console = Console(width=150)
+    console = Console(width=150, markup=False)
     offline_m = offline_ate_m(mcap, truth_file, options.frames)
     results = []
     for number in range(options.runs):
@@ -339,7 +339,7 @@ def main() -> int:
     with stem.with_suffix(".txt").open("w", encoding="utf-8") as file:
         file.write(f"Made by `{command}`\n\n{machine_line(described)}\n\n")
         for table in tables:
-            Console(file=file, width=150).print(table)
+            Console(file=file, width=150, markup=False).print(table)
     for table in tables:
         console.print(table)
     content = {

@@ -175,14 +175,14 @@ def main() -> None:
             frames[f"{scene}, {schedule}"] = [asdict(frame) for frame in found]
             print(scene, schedule, json.dumps(results[scene][schedule]), flush=True)
     described = machine(LIBRARIES)
-    Console(width=140).print(table(results))
+    Console(width=140, markup=False).print(table(results))
     options.out.mkdir(parents=True, exist_ok=True)
     stem = options.out / "overload"
     seeds = " ".join(map(str, options.seeds))
     with stem.with_suffix(".txt").open("w") as file:
         file.write(f"Made by `python benchmarks/overload.py --seeds {seeds}`\n\n")
         file.write(f"{machine_line(described)}\n\n")
-        Console(file=file, width=140).print(table(results))
+        Console(file=file, width=140, markup=False).print(table(results))
     written = {"machine": described, "seeds": options.seeds, "results": results, "frames": frames}
     stem.with_suffix(".json").write_text(json.dumps(written) + "\n")
 

@@ -204,14 +204,16 @@ def main() -> None:
         results[name] = {k: summary([o for o in found if o.trial.kind == k]) for k in KINDS}
         trials[name] = [as_entry(each) for each in found]
     described = machine(LIBRARIES)
-    console = Console(width=140)
+    console = Console(width=140, markup=False)
     console.print(table(results))
     options.out.mkdir(parents=True, exist_ok=True)
     stem = options.out / "relocalisation"
     with stem.with_suffix(".txt").open("w") as file:
-        command = f"python benchmarks/relocalisation.py --trials {options.trials}"
-        file.write(f"Made by `{command}` --seed {options.seed}\n\n{machine_line(described)}\n\n")
-        Console(file=file, width=140).print(table(results))
+        command = (
+            f"python benchmarks/relocalisation.py --trials {options.trials} --seed {options.seed}"
+        )
+        file.write(f"Made by `{command}`\n\n{machine_line(described)}\n\n")
+        Console(file=file, width=140, markup=False).print(table(results))
     written = {"machine": described, "seed": options.seed, "results": results, "trials": trials}
     stem.with_suffix(".json").write_text(json.dumps(written, indent=1) + "\n")
 

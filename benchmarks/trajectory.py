@@ -140,7 +140,7 @@ def write(
 ) -> None:
     """The table, JSON and plot."""
     table = table_of(summary, METHODS)
-    Console(width=160).print(table)
+    Console(width=160, markup=False).print(table)
     options.out.mkdir(parents=True, exist_ok=True)
     stem = options.out / ("trajectory_quick" if options.quick else "trajectory")
     described = machine(LIBRARIES)
@@ -148,7 +148,7 @@ def write(
     with stem.with_suffix(".txt").open("w") as file:
         file.write(f"Made by `{command}`\n\n{machine_line(described)}; ")
         file.write(f"every run on {options.cores} cores\n{options.note}\n")
-        Console(file=file, width=160).print(table)
+        Console(file=file, width=160, markup=False).print(table)
     result = {
         "command": command,
         "machine": described,

@@ -266,7 +266,7 @@ def main() -> int:
         raise SystemExit(f"{RECORDING} is not there; `make demo` makes it")
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    console = Console(width=150)
+    console = Console(width=150, markup=False)
     runs = []
     for number in range(options.pairs):
         with console.status(f"pair {number}"):
@@ -279,7 +279,7 @@ def main() -> int:
     stem = options.out / "viewer"
     with stem.with_suffix(".txt").open("w", encoding="utf-8") as file:
         file.write(f"Made by `{command}`\n\n{machine_line(described)}\n\n")
-        Console(file=file, width=150).print(table)
+        Console(file=file, width=150, markup=False).print(table)
     console.print(table)
     content = {
         "command": command,

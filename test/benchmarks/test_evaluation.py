@@ -190,7 +190,12 @@ def test_the_page_is_of_our_first_seeds(data, monkeypatch, tmp_path):
     asked: list[list[str]] = []
     monkeypatch.setattr(evaluation.subprocess, "run", lambda command, **_: asked.append(command))
     options = Namespace(
-        seeds=2, methods=["meslam", "tsdf"], frames=":", baseline_frames=":", cores=1
+        seeds=2,
+        other_seeds=1,
+        methods=["meslam", "tsdf"],
+        frames=":",
+        large_frames=":",
+        cores=1,
     )
     monkeypatch.setattr(evaluation, "CACHE", tmp_path / "cells")
     cells = evaluation.cells_of([Source(desk(data), "a desk")], options)
@@ -213,7 +218,9 @@ class ScriptedCell(evaluation.Cell):
 
 
 def scripted(data: Path, out: Path, script: str) -> ScriptedCell:
-    options = Namespace(seeds=1, methods=["tsdf"], frames=":", baseline_frames=":", cores=1)
+    options = Namespace(
+        seeds=1, other_seeds=1, methods=["tsdf"], frames=":", large_frames=":", cores=1
+    )
     [cell] = evaluation.cells_of([Source(desk(data), "a desk")], options)
     job = evaluation.SlamRun(cell.job.sequence, "tsdf", 0, ":", 1, out)
     made = ScriptedCell(cell.source, job)

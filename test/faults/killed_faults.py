@@ -37,16 +37,25 @@ KILLED_RUNS = 5
 
 
 def _killed_runs(bench: Bench, out: Path) -> Seen:
-    """Killed at random instants, then once more to the end."""
+    """Killed at random instants of the time that a whole run takes, then once more to the end."""
     from faults.kept_maps import lost_maps
 
     generator = random.Random(5)
-    lost, killed = [], 0
+    lost, killed, took_s = [], 0, 0.0
+
+    def watch(process: subprocess.Popen[str]) -> None:
+        nonlocal took_s
+        started(out, process)
+        begun = time.monotonic()
+        process.wait()
+        took_s = time.monotonic() - begun
+
+    bench.meslam("run", material.bag(bench), "--out", out, *QUICK, during=watch)
     for _ in range(KILLED_RUNS):
 
         def kill(process: subprocess.Popen[str]) -> None:
             started(out, process)
-            time.sleep(generator.uniform(0.0, 3.0))
+            time.sleep(generator.uniform(0.0, took_s))
             process.send_signal(signal.SIGKILL)
 
         done = bench.meslam("run", material.bag(bench), "--out", out, *QUICK, during=kill)

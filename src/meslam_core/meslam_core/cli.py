@@ -72,7 +72,9 @@ class _Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         try:
             result = super().invoke(ctx)
-            sys.stdout.flush()
+            # Service managers may start programs without it.
+            if sys.stdout is not None:
+                sys.stdout.flush()
             return result
         except MeslamError as error:
             complain(str(error))

@@ -32,7 +32,7 @@ from meslam_ros.viewer_settings import ViewerSettings
 
 NICENESS = 10
 CAMERA_PERIOD_S = 0.07
-IMAGE_PERIOD_S = 0.14
+IMAGE_PERIOD_S = 0.2
 PATH_PERIOD_S = 1.0
 # Nobody waits for a viewer: lost images are not sent again.
 BEST_EFFORT = images(ReliabilityPolicy.BEST_EFFORT, 1)

@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 POLL_S = 0.1
 # A region that has not changed for so long is meshed as finely as it is wanted.
 SETTLED_S = 3.0
-GROWING_RESOLUTION_M = 0.05
+GROWING_RESOLUTION_M = 0.06
 OCCUPANCY_CELL_M = 0.05
 OCCUPANCY_PERIOD_S = 0.5
 MAX_FAILURES = 3

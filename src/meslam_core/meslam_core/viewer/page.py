@@ -22,7 +22,7 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 TICK_S = 0.07
-IMAGE_PERIOD_S = 0.14
+IMAGE_PERIOD_S = 0.2
 PATH_PERIOD_S = 0.4
 LONG_PATH = 2000
 STATUS_PERIOD_S = 0.3
@@ -32,7 +32,7 @@ BRAND_COLOR = (56, 160, 102)
 class Page:
     """Shows a scene at `url` until it is closed.
 
-    What has changed is sent at most 14 times a second, images 7 times, and nothing while nobody
+    What has changed is sent at most 14 times a second, images 5 times, and nothing while nobody
     looks. Who looks can change what is shown, to all alike, and nothing of the map.
 
     Args:

@@ -273,6 +273,6 @@ TARGETS = [
         _camera_seeds,
         _bag_file,
         _mutated_camera,
-        seconds=20.0,
+        seconds=40.0,
     ),
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -32,8 +33,11 @@ _LENS_MODELS = {"brown_conrady": "plumb_bob", "kannala_brandt4": "equidistant"}
 
 PROBE_S = 120.0
 """Opening a file takes a second, on a busy computer some more [s]."""
+PROBE_CPU_S = 15
+"""Some damaged files keep librealsense busy for ever [s of processor time]."""
 _PROBE = """
-import os, sys
+import os, resource, sys
+resource.setrlimit(resource.RLIMIT_CPU, (int(sys.argv[2]), int(sys.argv[2])))
 import pyrealsense2 as rs
 try:
     device = rs.context().load_device(sys.argv[1])
@@ -79,16 +83,21 @@ def check_opens(path: Path) -> None:
         RecordingError: when pyrealsense2 is not installed, or the file cannot be opened.
     """
     _pyrealsense2(path)
-    command = [sys.executable, "-c", _PROBE, str(path)]
+    command = [sys.executable, "-c", _PROBE, str(path), str(PROBE_CPU_S)]
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PROBE_S, check=False
         )
     except subprocess.TimeoutExpired as error:
-        raise RecordingError(f"librealsense does not come to an end with {path}") from error
+        raise RecordingError(
+            f"librealsense cannot read {path}: it does not come to an end. The file is damaged, or "
+            "the computer has no time for it"
+        ) from error
     if done.returncode:
         told = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        reason = told if done.returncode > 0 and told else "it crashes"
+        endless = -done.returncode in (signal.SIGXCPU, signal.SIGKILL)
+        reason = "it does not come to an end" if endless else "it crashes"
+        reason = told if done.returncode > 0 and told else reason
         raise RecordingError(
             f"librealsense cannot read {path}: {reason}. The file is damaged, or newer than the "
             "installed pyrealsense2"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+
 from meslam_ros.domains import LAST_DOMAIN, taken_domains
 
 PAIRS = LAST_DOMAIN // 2

@@ -149,16 +149,24 @@ def test_a_view_that_shares_little_with_those_of_a_region_is_recognised(turn_deg
     assert np.linalg.norm(log(inverse(back) @ walk.keyframes.pose(latest[0]))[:3]) < 0.02
 
 
-@pytest.mark.parametrize(("off_m", "confirmed"), [(0.0, True), (0.1, False)])
-def test_an_old_keyframes_image_tells_whether_a_region_is_where_it_is_believed(off_m, confirmed):
+@pytest.mark.parametrize(
+    ("off_m", "recognised", "confirmed"),
+    [(0.0, False, True), (0.04, False, False), (0.04, True, True), (0.1, True, False)],
+)
+def test_an_old_keyframes_image_tells_whether_a_region_is_where_it_is_believed(
+    off_m, recognised, confirmed
+):
+    """A region that was recognised before is where it is: the path is not corrected again."""
     walk = Walk()
     for pose in POSES:
         walk.atlas.add_keyframe(walk.add(pose, pose)[0])
     region = walk.atlas.working
     region.confirmed, region.known_until = False, len(POSES)
+    region.recognised = recognised
     walk.atlas.settle()
     back = POSES[2] @ exp(np.array([0.03, 0.0, 0.02, 0.0, 0.02, 0.0]))
     believed = exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ back
     assert walk.recogniser.confirm(2, frame_at(back, 99, LARGE), believed) is confirmed
     assert region.confirmed is confirmed
+    assert region.recognised is (recognised or confirmed)
     assert len(walk.keyframes) == len(POSES)

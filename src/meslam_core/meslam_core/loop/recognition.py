@@ -23,6 +23,10 @@ log = logging.getLogger(__name__)
 # is corrected; smaller differences training and links even out.
 TOLERATED_M = 0.02
 TOLERATED_RAD = 0.01
+# Where a region was recognised after an earlier rest, its place among the others is known as well
+# as it will be: more than this is needed to correct the path once more.
+SETTLED_M = 0.06
+SETTLED_RAD = 0.035
 # After so many keyframes that told nothing only every so many are asked.
 MANY_DOUBTS = 8
 THEN_EVERY = 4
@@ -71,14 +75,16 @@ class RegionRecogniser:
                 return
             if links:
                 self._believe(links)
-                region.confirmed = True
+                region.confirmed = region.recognised = True
                 return
             yield
 
     def confirm(self, keyframe: int, frame: RgbdFrame, T_map_camera: Pose) -> bool:
         """Whether a frame is where it is believed to be, as a keyframe's image tells.
 
-        The regions that were trained with the keyframe are then known to be where they are.
+        The regions that were trained with the keyframe are then known to be where they are. Where
+        all of them have been recognised before, small differences are left to tracking: they are
+        those of the map, and would be found again at every visit.
 
         Args:
             keyframe: number of one whose images are kept.
@@ -88,10 +94,19 @@ class RegionRecogniser:
         T_map_keyframe = self._keyframes.pose(keyframe)
         guess = inverse(T_map_keyframe) @ T_map_camera
         found = self._linker.find(keyframe, self._linker.prepare(self._linker.image(frame)), guess)
-        if found is None or _is_far(inverse(guess) @ found.T_target_source):
+        if found is None:
             return False
-        for region in self._atlas.doubtful:
-            region.confirmed = keyframe < region.known_until and keyframe in region.keyframes
+        apart = inverse(guess) @ found.T_target_source
+        regions = [
+            region
+            for region in self._atlas.doubtful
+            if keyframe < region.known_until and keyframe in region.keyframes
+        ]
+        settled = bool(regions) and all(region.recognised for region in regions)
+        if _is_far(apart) and not (settled and not _is_far(apart, SETTLED_M, SETTLED_RAD)):
+            return False
+        for region in regions:
+            region.confirmed = region.recognised = True
         return True
 
     def _believe(self, links: list[MeasuredMotion]) -> None:
@@ -120,7 +135,9 @@ class RegionRecogniser:
             keyframes.add_link(each.first, each.second, each.T_first_second)
 
 
-def _is_far(apart: Pose) -> bool:
-    """Whether two poses differ by more than training evens out."""
-    far = float(np.linalg.norm(apart[:3, 3])) > TOLERATED_M
-    return far or rotation_angle(apart) > TOLERATED_RAD
+def _is_far(
+    apart: Pose, tolerated_m: float = TOLERATED_M, tolerated_rad: float = TOLERATED_RAD
+) -> bool:
+    """Whether two poses differ by more, if nothing else is said, than training evens out."""
+    far = float(np.linalg.norm(apart[:3, 3])) > tolerated_m
+    return far or rotation_angle(apart) > tolerated_rad

@@ -64,6 +64,7 @@ class Region:
         has_worked: whether it was the working region in this session.
         confirmed: whether the camera is known to be where this region's map has it; after a rest
             the path may have drifted.
+        recognised: whether it was known once after a rest.
         known_until: keyframes below this number are from before that rest.
         doubts: keyframes since it woke that did not tell.
         origin: what it was when this session began, where it is from an earlier one.
@@ -88,6 +89,7 @@ class Region:
         self.unmarked: list[int] = []
         self.has_worked = False
         self.confirmed = True
+        self.recognised = False
         self.known_until = 0
         self.doubts = 0
         self.origin: RegionOrigin | None = None

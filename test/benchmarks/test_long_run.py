@@ -48,9 +48,16 @@ def test_a_run_that_does_not_grow_keeps_all_limits():
 )
 def test_each_growth_exceeds_its_limit(limit, changed):
     samples = [sample(minute) for minute in MINUTES]
-    found = long_run.verdict([*samples[:-1], replace(samples[-1], **changed)])
+    late = [replace(each, **changed) for each in samples[-len(samples) // 4 :]]
+    found = long_run.verdict([*samples[: -len(late)], *late])
     assert [name for name, kept in found["kept"].items() if not kept] == [limit]
     assert f"Exceeded: {limit}." in long_run.sentence(found)
+
+
+def test_a_file_that_is_open_for_a_moment_is_no_growth():
+    samples = [sample(minute) for minute in MINUTES]
+    found = long_run.verdict([*samples[:-1], replace(samples[-1], files=13)])
+    assert all(found["kept"].values())
 
 
 def test_tracking_that_becomes_slower_exceeds_its_limit():

@@ -67,6 +67,21 @@ def test_no_frame_comes_before_its_time():
         assert time_s >= 0.1 * number - 1e-6
 
 
+def test_reading_a_frame_makes_the_one_before_no_later():
+    clock = Clock()
+
+    def read_slowly():
+        for frame in frames(6):
+            clock.now_s += 0.03
+            yield frame
+
+    times = []
+    for _ in PacedFrames(read_slowly(), clock.read, clock.wait):
+        times.append(clock.now_s)
+        clock.now_s += 0.05
+    assert np.diff(times) == pytest.approx([0.1] * 5)
+
+
 def test_no_frames_are_no_frames():
     assert play([], work_s=0.1) == ([], [], 0)
 

@@ -38,7 +38,7 @@ class PacedFrames:
         self._error: Exception | None = None
 
     def __iter__(self) -> Iterator[RgbdFrame]:
-        pending = self._next()
+        pending, following = self._next(), self._next()
         first_stamp_ns = 0 if pending is None else pending.stamp_ns
         started = self._clock()
         self._started_s, self._first_stamp_ns = started, first_stamp_ns
@@ -47,12 +47,12 @@ class PacedFrames:
             if wait_s > 0:
                 self._sleep(wait_s)
             now_ns = first_stamp_ns + round((self._clock() - started) * 1e9)
-            following = self._next()
             while following is not None and following.stamp_ns <= now_ns:
                 pending, following = following, self._next()
                 self.skipped += 1
             yield pending
-            pending = following
+            # Read after the frame has been worked on: a camera's images need not be read.
+            pending, following = following, self._next()
         if self._error is not None:
             raise self._error
 

@@ -41,6 +41,7 @@ from meslam_interfaces.msg import TrackingStatus
 from meslam_ros import topics
 from meslam_ros.client import MeslamClient
 from meslam_ros.conversions import stamp_ns
+from meslam_ros.domains import free_domain
 from meslam_ros.node_settings import PlayerSettings
 from meslam_ros.processes import NodeProcess, ros_arguments
 from meslam_ros.qos import STREAM
@@ -322,7 +323,7 @@ def main() -> int:
     if not data or not (Path(data) / RECORDING).is_dir():
         raise SystemExit(f"MESLAM_DATA must name the folder that holds {RECORDING}")
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    os.environ.setdefault("ROS_DOMAIN_ID", str(free_domain(os.getpid())))
     truth_file = Path(data) / RECORDING / "groundtruth.txt"
     mcap = mcap_of(Path(data) / RECORDING)
     truth = read_tum(truth_file)

@@ -40,6 +40,7 @@ from websockets.typing import Subprotocol
 from meslam_interfaces.msg import TrackingStatus
 from meslam_ros import topics
 from meslam_ros.client import MeslamClient
+from meslam_ros.domains import free_domain
 from meslam_ros.processes import NodeProcess, ros_arguments
 from meslam_ros.qos import STREAM
 from meslam_ros.slam_node import NODES
@@ -265,7 +266,7 @@ def main() -> int:
     if not RECORDING.exists():
         raise SystemExit(f"{RECORDING} is not there; `make demo` makes it")
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    os.environ.setdefault("ROS_DOMAIN_ID", str(free_domain(os.getpid())))
     console = Console(width=150, markup=False)
     runs = []
     for number in range(options.pairs):
@@ -274,7 +275,7 @@ def main() -> int:
     alone, watched = (statistics.median(pair[i].fps for pair in runs) for i in (0, 1))
     loss = 1.0 - watched / alone
     table, described = table_of(runs, loss), machine(("numpy", "viser"))
-    command = "python benchmarks/viewer.py"
+    command = f"python benchmarks/viewer.py --frames {options.frames} --pairs {options.pairs}"
     options.out.mkdir(parents=True, exist_ok=True)
     stem = options.out / "viewer"
     with stem.with_suffix(".txt").open("w", encoding="utf-8") as file:

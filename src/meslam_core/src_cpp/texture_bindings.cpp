@@ -14,7 +14,7 @@ constexpr py::ssize_t kMaxSide = 1 << 17;
 
 TextureAtlas texture_atlas(const py::array& image, const py::array& levels) {
     if (!py::isinstance<py::array_t<uint8_t>>(image) || image.ndim() != 3 || image.shape(2) != 3 ||
-        std::min(image.shape(0), image.shape(1)) < 2 ||
+        image.shape(0) < 2 || image.shape(1) < 3 ||
         std::max(image.shape(0), image.shape(1)) > kMaxSide ||
         !(image.flags() & py::array::c_style)) {
         throw py::value_error("image has dtype " + std::string(py::str(image.dtype())) +

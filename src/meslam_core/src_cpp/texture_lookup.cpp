@@ -113,7 +113,7 @@ void find(const TriangleTexels& texels, const RayHits& hits, size_t first, size_
     }
     for (size_t i = 0; i < count; ++i) {
         // Between the footprint's short and long axis: neither shimmering nor washed out.
-        const float slant = std::sqrt(std::max(hits.cosine[first + i], kLeastCosine));
+        const float slant = std::sqrt(std::max(kLeastCosine, hits.cosine[first + i]));
         places.footprint[i] = hits.distance[first + i] / (focal_px * places.footprint[i] * slant);
     }
 }
@@ -132,7 +132,7 @@ void shade(const TextureAtlas& atlas, const TriangleTexels& texels, const RayHit
                 color[0] = color[1] = color[2] = 0.0f;
                 continue;
             }
-            const float fineness = std::log2(std::clamp(places.footprint[i], 1.0f, coarsest));
+            const float fineness = std::log2(std::min(coarsest, std::max(1.0f, places.footprint[i])));
             const int level = static_cast<int>(fineness);
             const float share = fineness - static_cast<float>(level);
             const Rgb fine = bilinear(quad(atlas, level, places.x[i], places.y[i]));

@@ -6,7 +6,7 @@
 
 namespace meslam {
 
-// An 8-bit RGB image that holds all levels, rows one after the other; at least 2 x 2.
+// An 8-bit RGB image that holds all levels, rows one after the other; at least 3 wide and 2 high.
 struct TextureAtlas {
     const uint8_t* texels;
     int width, height;

@@ -48,7 +48,8 @@ BASELINE = "imap_star"
 METHODS = ("meslam", *(name for name in PRESETS if name not in ("default", BASELINE)))
 METHODS = (*METHODS, BASELINE, *PEERS)
 QUICK_METHODS = ("meslam", BASELINE, *PEERS)
-QUICK_FRAMES, QUICK_LARGE_FRAMES, QUICK_S = ":40", ":15", 3.0
+# Enough to turn by, or an alignment's lever arm could not be found.
+QUICK_FRAMES, QUICK_S = ":40", 3.0
 # Large networks take long, and the baseline is lost in large scenes anyway.
 LARGE = (BASELINE, "paper")
 LARGE_FRAMES = ":300"
@@ -256,7 +257,7 @@ def parsed_options() -> argparse.Namespace:
     options.methods = options.methods or list(QUICK_METHODS if quick else METHODS)
     options.seeds = options.seeds or (1 if quick else SEEDS)
     options.frames = options.frames or (QUICK_FRAMES if quick else ":")
-    usual = QUICK_LARGE_FRAMES if quick else LARGE_FRAMES
+    usual = QUICK_FRAMES if quick else LARGE_FRAMES
     options.large_frames = options.large_frames or usual
     page = CACHE / ("report_quick.html" if quick else "report.html")
     options.page = options.page or page

@@ -6,7 +6,7 @@ import json
 from functools import cache
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from data.analytic_scene import SphereInRoom, learnt_field, stored
@@ -15,19 +15,24 @@ from fuzz.map_targets import encoded_regions, use_region
 from fuzz.mutation import Parts, mutated_json, mutated_parts
 from fuzz.region_bytes import mutated_region
 from fuzz.target import Target
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as NavPath
 from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
 from meslam_core import se3
 from meslam_core.camera import register_depth_to_color
 from meslam_core.config import MeslamConfig
-from meslam_core.errors import FrameError
+from meslam_core.errors import FrameError, MapError
 from meslam_core.map import codec
 from meslam_core.recordings.lens import Lens
 from meslam_core.recordings.transforms import FrameTree
+from meslam_core.regions.grid import RegionIndex as RegionIndexKey
+from meslam_core.viewer.panel import status_html
+from meslam_core.viewer.scene import Scene
 from meslam_interfaces import srv
-from meslam_interfaces.msg import RegionModel
+from meslam_interfaces.msg import RegionIndex, RegionModel, TrackingStatus
 from meslam_ros.answers import Code, answering
 from meslam_ros.call_service import fill, interface
 from meslam_ros.conversions import (
@@ -43,6 +48,7 @@ from meslam_ros.conversions import (
     to_transform,
 )
 from meslam_ros.given_map import GivenMap
+from meslam_ros.live_scene import LiveScene
 from meslam_ros.map_models import MapModels
 from meslam_ros.map_requests import MapRequests
 from meslam_ros.mesh_requests import MeshRequests
@@ -230,6 +236,60 @@ def _given(parts: Parts, folder: Path) -> str:
     return str(given.continuation.train)
 
 
+SHOWN = ("status.json", "pose.json", "path.json", "info.json")
+
+
+def _shown_seeds() -> list[Parts]:
+    pose = PoseStamped(pose=to_pose(se3.exp(np.array([0.1, 0.2, 0.0, 0.0, 0.0, 0.3]))))
+    status = TrackingStatus(map_id="map", state=TrackingStatus.OK, training_regions=[RegionIndex()])
+    messages = status, pose, NavPath(poses=[pose]), camera_to_info(CAMERA, to_stamp(START_NS), "c")
+    texts = {name: as_json(each) for name, each in zip(SHOWN, messages, strict=True)}
+    return [texts | seed for seed in _model_seeds()]
+
+
+def _mutated_shown(parts: Parts, others: list[Parts], rng: Random) -> Parts:
+    model = {name: parts[name] for name in ("fields.json", "data")}
+    texts = {name: parts[name] for name in SHOWN}
+    if rng.random() < 0.5:
+        return parts | _mutated_model(model, others, rng)
+    return mutated_parts(texts, others, rng) | model
+
+
+def _shown(parts: Parts, folder: Path) -> str:
+    """What the live page makes of messages; one that is refused leaves the others shown."""
+    scene, taken = Scene(), _Taken()
+    live = LiveScene(scene, cast("Any", taken), lambda frame: None)
+    live.take_status(filled(TrackingStatus(), parts["status.json"]))
+    refused: list[str] = []
+    for take, message in (
+        (live.take_model, _model_message(parts)),
+        (live.take_info, filled(CameraInfo(), parts["info.json"])),
+        (live.take_pose, filled(PoseStamped(), parts["pose.json"])),
+        (live.take_path, filled(NavPath(), parts["path.json"])),
+    ):
+        try:
+            take(message)
+        except (FrameError, MapError) as error:
+            refused.append(str(error))
+    live.notice_silence()
+    assert all(refused)
+    assert np.isfinite(scene.bounds).all()
+    assert status_html(scene)
+    return f"{scene.status.value.state} {taken.models} {len(refused)}"
+
+
+class _Taken:
+    """Counts the models that would be meshed."""
+
+    models = 0
+
+    def begin(self) -> None:
+        pass
+
+    def take(self, index: RegionIndexKey, version: int, data: bytes) -> None:
+        self.models += 1
+
+
 def _odometry_seeds() -> list[Parts]:
     message = Odometry(child_frame_id="base")
     message.header.frame_id = "odom"
@@ -376,6 +436,7 @@ TARGETS = [
     Target("camera_info", "sensor_msgs/CameraInfo and its lens", _info_seeds, _info),
     Target("region message", "RegionModel to the served map", _model_seeds, _model, _mutated_model),
     Target("given map", "UseMap: a map to track in", _given_seeds, _given, _mutated_given),
+    Target("shown messages", "what the live page shows", _shown_seeds, _shown, _mutated_shown),
     Target("odometry message", "nav_msgs/Odometry", _odometry_seeds, _odometry),
     Target("transforms", "tf2_msgs/TFMessage", _transform_seeds, _transforms),
     Target(

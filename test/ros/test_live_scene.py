@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from data.synthetic_frames import CAMERA
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
+from sensor_msgs.msg import CameraInfo
 
+from meslam_core.errors import FrameError, MapError
 from meslam_core.viewer.scene import RegionState, Scene
 from meslam_interfaces.msg import RegionIndex, RegionModel, TrackingStatus
 from meslam_ros import live_scene
@@ -46,6 +49,8 @@ def model(index=(0, 0, 0), version: int = 1, map_id: str = "a") -> RegionModel:
         map_id=map_id, index=np.array(index, np.int32), version=version, keyframes=4
     )
     message.size_m.x, message.observed_volume_m3, message.data = 3.0, 5.0, [1, 2, 3]
+    message.format = RegionModel.FORMAT
+    message.sha256 = hashlib.sha256(message.data).hexdigest()
     message.pose.orientation.w = 1.0
     return message
 
@@ -110,6 +115,31 @@ def test_poses_are_those_of_the_camera_and_rest_is_not_path() -> None:
     assert np.allclose(live.scene.camera.value.T_map_camera[:3, 3], [0.3, 0.5, 0.0])
     live.messages.take_path(Path(poses=[pose(0.0), pose(0.4)]))
     assert np.allclose(live.scene.refined_path.value, [[0.0, 0.5, 0.0], [0.4, 0.5, 0.0]])
+
+
+def test_nonsense_is_refused_and_changes_nothing() -> None:
+    live = Live()
+    live.messages.take_model(model())
+    spoilt = [model((1, 0, 0), map_id=map_id) for map_id in ("a", "b", "b")]
+    spoilt[0].data[0] = 9
+    spoilt[1].size_m.x = -1.0
+    spoilt[2].pose.position.x = float("nan")
+    for message in spoilt:
+        with pytest.raises(MapError, match=r"region \[1, 0, 0\]"):
+            live.messages.take_model(message)
+    nowhere = PoseStamped()
+    nowhere.pose.position.z = float("inf")
+    for take, message in (
+        (live.messages.take_pose, nowhere),
+        (live.messages.take_path, Path(poses=[pose(0.0), nowhere])),
+        (live.messages.take_info, CameraInfo()),
+    ):
+        with pytest.raises(FrameError):
+            take(message)
+    assert [box.index for box in live.scene.regions.value] == [(0, 0, 0)]
+    assert live.background.maps == 1
+    assert live.scene.camera.value is None
+    assert not len(live.scene.refined_path.value)
 
 
 def test_what_it_waits_for_and_silence_are_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,3 +83,27 @@ def test_unknown_frames_and_times_are_named(
     with pytest.raises(FrameError) as error:
         buffer.lookup("map", frame, stamp)
     assert all(word in str(error.value) for word in words)
+
+
+def test_frames_without_end_cost_no_memory(
+    buffer: TransformBuffer, client: MeslamClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transform_buffer, "MAX_FRAMES", 3)
+    publisher = client.node.create_publisher(TFMessage, topics.TF, STREAM)
+    assert client.spin_until(lambda: publisher.get_subscription_count() > 0, WAIT_S)
+    stamp = to_stamp(20 * NANOSECONDS)
+    publisher.publish(
+        TFMessage(
+            transforms=[
+                to_transform(np.eye(4), stamp, "base", "one_too_many"),
+                to_transform(T_odom_base(9.5), stamp, "odom", "base"),
+            ]
+        )
+    )
+
+    def moved_on() -> bool:
+        return np.allclose(buffer.lookup("odom", "base"), T_odom_base(9.5), atol=1e-9)
+
+    assert client.spin_until(moved_on, WAIT_S)
+    with pytest.raises(FrameError, match="one_too_many"):
+        buffer.lookup("base", "one_too_many")

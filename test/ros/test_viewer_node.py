@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import nav_msgs.msg
 import numpy as np
 import pytest
 from data.analytic_scene import SphereInRoom, learnt_field, stored
@@ -23,7 +24,7 @@ from meslam_ros import topics
 from meslam_ros.client import MeslamClient
 from meslam_ros.conversions import camera_to_info, color_message, to_pose, to_stamp
 from meslam_ros.processes import NodeProcess, ros_arguments
-from meslam_ros.qos import STREAM, images
+from meslam_ros.qos import STREAM, images, latched
 from meslam_ros.transforms import StaticBroadcaster
 
 WAIT_S = 120.0
@@ -43,7 +44,16 @@ class Tracker:
         self._info = create(CameraInfo, topics.COLOR_INFO, images(STREAM.reliability))
         self._image = create(Image, topics.COLOR, images(STREAM.reliability))
         self._mount = StaticBroadcaster(client.node, BODY_OPTICAL, "camera_link", "optical")
+        self._path = create(nav_msgs.msg.Path, topics.PATH, latched())
         self.frames = 0
+
+    def mislead(self) -> None:
+        """What no tracking says, and somebody else may."""
+        nowhere = PoseStamped()
+        nowhere.pose.position.x = float("nan")
+        self._pose.publish(nowhere)
+        self._path.publish(nav_msgs.msg.Path(poses=[nowhere]))
+        self._info.publish(CameraInfo())
 
     def track(self, y: float = 0.0, **status: object) -> None:
         """One frame at a place beside the ball."""
@@ -98,6 +108,11 @@ def test_the_page_follows_a_running_system(client, page: Page, region: StoredReg
     wait_for_text(page, topics.STATUS)
     tracker = Tracker(client)
     until(client, tracker.track, lambda: count(screenshot(page), BALL) > MANY)
+    spoilt = [model(replace(region, index=(9, 0, 0))) for _ in range(2)]
+    spoilt[0].data[100] ^= 1
+    spoilt[1].size_m.x = -1.0
+    publish(client, *spoilt)
+    tracker.mislead()
     until(client, tracker.track, lambda: count(screenshot(page), IMAGE, 12) > MANY)
     working = count(screenshot(page), WORKING, 12)
     assert working > SOME

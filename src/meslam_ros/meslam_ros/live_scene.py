@@ -20,7 +20,7 @@ from meslam_core.viewer.scene import RegionBox, RegionState, Scene, Status, came
 from meslam_interfaces.msg import Region, RegionModel, TrackingStatus
 from meslam_ros import topics
 from meslam_ros.conversions import camera_from_info, from_pose
-from meslam_ros.region_catalog import RegionCatalog, RegionEntry, region_index
+from meslam_ros.region_catalog import RegionCatalog, RegionEntry, check_payload, region_index
 
 REGION_STATES = {
     Region.AT_REST: RegionState.AT_REST,
@@ -86,12 +86,20 @@ class LiveScene:
         return len(self._catalog.entries)
 
     def take_info(self, info: CameraInfo) -> None:
-        """Take the camera's intrinsics and frame."""
+        """Take the camera's intrinsics and frame.
+
+        Raises:
+            FrameError: when there are no intrinsics in it.
+        """
         self._camera = camera_from_info(info, topics.COLOR_INFO)
         self._camera_frame = info.header.frame_id
 
     def take_pose(self, message: PoseStamped) -> None:
-        """Take the base's pose of a frame."""
+        """Take the base's pose of a frame.
+
+        Raises:
+            FrameError: when it is none.
+        """
         T_map_camera = from_pose(message.pose) @ self._T_base_camera()
         self._scene.camera.set(camera_view(T_map_camera, self._camera))
         position = T_map_camera[:3, 3]
@@ -99,7 +107,11 @@ class LiveScene:
             self._extend_path(position)
 
     def take_path(self, message: Path) -> None:
-        """Take the refined path."""
+        """Take the refined path.
+
+        Raises:
+            FrameError: when a pose of it is none.
+        """
         if not message.poses:
             self._scene.refined_path.set(np.zeros((0, 3)))
             return
@@ -107,12 +119,17 @@ class LiveScene:
         self._scene.refined_path.set((poses @ self._T_base_camera())[:, :3, 3])
 
     def take_model(self, model: RegionModel) -> None:
-        """Take a region's network, unless it is of a map before, or not news."""
+        """Take a region's network, unless it is of a map before, or not news.
+
+        Raises:
+            MapError: when the model is damaged or its header cannot be that of a region.
+        """
         if self._live_map_id not in ("", model.map_id) or not self._catalog.is_news(model):
             return
+        check_payload(model)
+        entry = RegionEntry.of(model)
         if model.map_id != self._catalog.map_id:
             self._begin(model.map_id)
-        entry = RegionEntry.of(model)
         self._catalog.add(entry)
         self._background.take(entry.index, entry.version, bytes(model.data))
         self._show_regions()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from meslam_core.config import MeslamConfig
+from meslam_core.errors import MapError
 from meslam_core.map.neural_map import NeuralMap
 from meslam_core.map.placed_region import PlacedRegion
 from meslam_core.map.reader import LoadedMap
@@ -18,7 +20,7 @@ from meslam_core.map.stored_region import StoredRegion
 from meslam_core.map.surface import MapSurfaces
 from meslam_core.regions.grid import RegionGrid, RegionIndex
 from meslam_interfaces.msg import RegionArray, RegionModel
-from meslam_ros.region_catalog import RegionCatalog, RegionEntry
+from meslam_ros.region_catalog import RegionCatalog, RegionEntry, model_name
 from meslam_ros.region_messages import encoded_model, stored_region
 
 
@@ -73,17 +75,24 @@ class MapModels:
     Args:
         config: of the map's answers and of the lattice.
         map_frame: of the regions' poses.
+        max_bytes: tells how much memory models that are sent may take [bytes].
 
     Attributes:
         before_replacing: called with the identity of a map before that takes the place of the one
             that is there.
     """
 
-    def __init__(self, config: MeslamConfig, map_frame: str) -> None:
+    def __init__(
+        self,
+        config: MeslamConfig,
+        map_frame: str,
+        max_bytes: Callable[[], float] = lambda: math.inf,
+    ) -> None:
         self.before_replacing: Callable[[str], None] = lambda map_id: None
         self._catalog = RegionCatalog()
         self._config = config
         self._map_frame = map_frame
+        self._max_bytes = max_bytes
         self._lattice: RegionGrid | None = None
         self._regions: dict[RegionIndex, PlacedRegion] = {}
         self._data: dict[RegionIndex, bytes] = {}
@@ -100,12 +109,15 @@ class MapModels:
         a stored one: the loaded map stays until tracking begins a new one.
 
         Raises:
-            MapError: when the model is damaged, of another format, or contradicts itself.
+            MapError: when the model is damaged, of another format, contradicts itself, or the map
+                would become too large with it.
         """
         with self._lock:
             if not self._is_wanted(model):
                 return False
-        region = self._placed(stored_region(model))
+        stored = stored_region(model)
+        self._check_size(model, stored)
+        region = self._placed(stored)
         if model.map_id != self.map_id:
             self.before_replacing(model.map_id)
         with self._lock:
@@ -119,6 +131,17 @@ class MapModels:
             self._data[region.stored.index] = bytes(model.data)
             self._snapshot = None
             return True
+
+    def _check_size(self, model: RegionModel, region: StoredRegion) -> None:
+        with self._lock:
+            regions = self._regions if model.map_id == self._catalog.map_id else {}
+            others = (other.stored for i, other in regions.items() if i != region.index)
+            needed = region.size_in_memory + sum(other.size_in_memory for other in others)
+        if needed > self._max_bytes():
+            raise MapError(
+                f"{model_name(model)}: with it the map would take {needed / 1e6:.0f} MB of "
+                "memory; max_map_mb allows less"
+            )
 
     def _placed(self, region: StoredRegion) -> PlacedRegion:
         """A region ready to answer; made once, for it takes milliseconds."""

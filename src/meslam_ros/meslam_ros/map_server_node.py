@@ -58,7 +58,9 @@ class MapServerNode(ManagedNode):
     def configure(self) -> None:
         self._config = read_config(self)
         limit_threads(self._config.runtime.threads, load_open3d=False)
-        self._models = MapModels(self._config, self._frames.map_frame)
+        self._models = MapModels(
+            self._config, self._frames.map_frame, lambda: 1e6 * self._settings.max_map_mb
+        )
         log = self.get_logger()
         self._keeper = MapKeeper(
             self._models, self._kept_folder, self._settings, log.info, log.warn

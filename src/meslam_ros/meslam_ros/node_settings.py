@@ -267,6 +267,14 @@ class MapServerSettings:
         maximum=100_000_000_000,
         live=True,
     )
+    max_map_mb: int = setting(
+        4000,
+        "region models with which the map would take more memory are refused",
+        unit="MB",
+        minimum=1,
+        maximum=1_000_000,
+        live=True,
+    )
     grid_resolution_m: float = setting(
         0.05,
         "cell of the occupancy grid by default",

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from geometry_msgs.msg import Pose
 
 from meslam_core.errors import FrameError, MapError
+from meslam_core.map.manifest import MAX_REGIONS
 from meslam_core.regions.grid import RegionIndex
 from meslam_interfaces.msg import Region, RegionArray, RegionModel
 from meslam_ros.conversions import from_pose, stamp_ns, to_stamp
@@ -96,8 +97,14 @@ class RegionCatalog:
         return model.map_id != self.map_id or known is None or model.version > known.version
 
     def add(self, entry: RegionEntry) -> None:
-        """Take a region's newest entry; its state stays."""
+        """Take a region's newest entry; its state stays.
+
+        Raises:
+            MapError: when it is one more than can be stored.
+        """
         known = self.entries.get(entry.index)
+        if known is None and len(self.entries) >= MAX_REGIONS:
+            raise MapError(f"region {list(entry.index)}: a map has at most {MAX_REGIONS} regions")
         self.entries[entry.index] = replace(entry, state=known.state if known else entry.state)
 
     def set_active(self, working: RegionIndex | None, training: set[RegionIndex]) -> bool:

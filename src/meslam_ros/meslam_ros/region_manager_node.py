@@ -86,14 +86,14 @@ class RegionManagerNode(ManagedNode):
         try:
             check_payload(model)
             entry = RegionEntry.of(model)
+            if model.map_id != self._catalog.map_id:
+                self._catalog.begin(model.map_id)
+            is_new = entry.index not in self._catalog.entries
+            self._catalog.add(entry)
         except MapError as error:
             self._refused += 1
             self.get_logger().error(f"region model refused: {error}")
             return
-        if model.map_id != self._catalog.map_id:
-            self._catalog.begin(model.map_id)
-        is_new = region_index(model.index) not in self._catalog.entries
-        self._catalog.add(entry)
         self._changed = True
         if is_new:
             self._publish()

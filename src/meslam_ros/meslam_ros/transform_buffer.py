@@ -15,6 +15,7 @@ from tf2_msgs.msg import TFMessage
 
 from meslam_core import se3
 from meslam_core.errors import FrameError
+from meslam_core.recordings.transforms import MAX_FRAMES
 from meslam_ros import topics
 from meslam_ros.conversions import NANOSECONDS, from_transform, stamp_ns
 from meslam_ros.qos import latched
@@ -159,6 +160,8 @@ class TransformBuffer:
                 except FrameError:
                     continue
                 edge = self._edges.get(child)
+                if edge is None and len(self._edges) >= MAX_FRAMES:
+                    continue
                 if edge is None or edge.parent != parent or edge.static != static:
                     edge = self._edges[child] = _Edge(parent, static)
                 edge.add(stamp_ns(transform.header.stamp), pose)

@@ -71,7 +71,8 @@ class StaticTransforms:
             self._tree.add(message)
             for transform in message.transforms:
                 child = transform.child_frame_id.lstrip("/")
-                self._parents[child] = transform.header.frame_id.lstrip("/")
+                if child in self._tree:
+                    self._parents[child] = transform.header.frame_id.lstrip("/")
 
 
 @dataclass(frozen=True)

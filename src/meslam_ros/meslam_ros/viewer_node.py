@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
-from meslam_core.errors import FrameError
+from meslam_core.errors import FrameError, MapError
 from meslam_core.se3 import Pose
 from meslam_core.viewer.camera_image import reduced
 from meslam_core.viewer.scene import ViewControls
@@ -29,6 +30,8 @@ from meslam_ros.qos import MODELS_DEPTH, STREAM, images, latched
 from meslam_ros.rgbd_input import STEADY
 from meslam_ros.transforms import BaseFrame, StaticTransforms
 from meslam_ros.viewer_settings import ViewerSettings
+
+T = TypeVar("T")
 
 NICENESS = 10
 CAMERA_PERIOD_S = 0.07
@@ -63,7 +66,7 @@ class ViewerNode(ManagedNode):
 
     def activate(self) -> None:
         self._models = self.create_subscription(
-            RegionModel, topics.REGION_MODELS, self._live.take_model, latched(MODELS_DEPTH)
+            RegionModel, topics.REGION_MODELS, self._take_model, latched(MODELS_DEPTH)
         )
         self._status = LookedUpTopic(self, TrackingStatus, topics.STATUS, STREAM)
         self._pose = LookedUpTopic(self, PoseStamped, topics.POSE, STREAM)
@@ -108,12 +111,12 @@ class ViewerNode(ManagedNode):
         for status in self._status.news():
             self._live.take_status(status)
         for pose in self._pose.news():
-            self._take_pose(pose)
+            self._take(self._live.take_pose, pose)
 
     def _show_image(self) -> None:
         self._follow_viewers()
         if (info := self._info.newest()) is not None:
-            self._take_info(info)
+            self._take(self._live.take_info, info)
         if self._watched is None or (message := self._watched[0].newest()) is None:
             return
         try:
@@ -126,18 +129,16 @@ class ViewerNode(ManagedNode):
     def _show_path(self) -> None:
         self._live.notice_silence()
         if self._watched is not None and (path := self._watched[1].newest()) is not None:
-            self._live.take_path(path)
+            self._take(self._live.take_path, path)
 
-    def _take_pose(self, message: PoseStamped) -> None:
-        try:
-            self._live.take_pose(message)
-        except FrameError as error:
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+    def _take_model(self, model: RegionModel) -> None:
+        self._take(self._live.take_model, model)
 
-    def _take_info(self, info: CameraInfo) -> None:
+    def _take(self, take: Callable[[T], None], message: T) -> None:
+        """Take a message that may hold anything; what cannot be shown is told."""
         try:
-            self._live.take_info(info)
-        except FrameError as error:
+            take(message)
+        except (FrameError, MapError) as error:
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
 
     def _T_base_camera(self, camera_frame: str) -> Pose | None:

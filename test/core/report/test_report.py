@@ -182,6 +182,14 @@ def test_columns_that_were_not_recorded_are_named(make_run):
     assert "tracking" not in note
 
 
+def test_states_alone_are_shown(make_run):
+    folder = make_run()
+    (folder / "frames.csv").write_text("stamp_s,state\n1.0,OK\n2.0,LOST\n")
+    page = made(folder)
+    assert "<svg" in section(page, "tracking")
+    assert 'id="growth"' not in page.source
+
+
 def test_without_a_map_and_a_path_the_rest_is_shown(make_run):
     folder = make_run(frames_tracked=0, frames_lost=16)
     for name in ("trajectory.txt", "trajectory_online.txt", "map.meslam/manifest.json"):

@@ -15,7 +15,7 @@ import pytest
 from meslam_core.errors import MapError
 from meslam_core.map.codec import encode
 from meslam_core.map.stored_region import StoredRegion
-from meslam_core.viewer.background_map import GROWING_RESOLUTION_M, BackgroundMap
+from meslam_core.viewer.background_map import GROWING_RESOLUTION_M, MAX_FAILURES, BackgroundMap
 from meslam_core.viewer.scene import Scene, ViewControls
 
 WAIT_S = 60.0
@@ -136,6 +136,22 @@ def test_a_killed_process_is_replaced(watched: Watched, region: StoredRegion) ->
     os.kill(watched.map.process.pid, signal.SIGKILL)
     watched.map.take(HERE, region.version, encode(region))
     wait_for(lambda: watched.version(HERE) == region.version)
+
+
+def test_a_process_that_ends_again_and_again_is_given_up() -> None:
+    background = BackgroundMap(Scene(), ViewControls(), lambda: False)
+    try:
+        for _ in range(MAX_FAILURES + 1):
+            process = background.process
+            os.kill(process.pid, signal.SIGKILL)
+            # Asking finds that it has ended.
+            with pytest.raises(MapError, match=r"has ended; try again|no mesh any more"):
+                background.export(0.1, ".ply")
+            wait_for(lambda ended=process: background.process is not ended or background.given_up)
+        with pytest.raises(MapError, match="no mesh any more"):
+            background.export(0.1, ".ply")
+    finally:
+        background.close()
 
 
 def test_the_process_works_only_when_no_other_program_does(watched: Watched) -> None:

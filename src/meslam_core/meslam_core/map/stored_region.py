@@ -85,6 +85,11 @@ class StoredRegion:
         """Half the side of the box: the unit of region coordinates [m]."""
         return 0.5 * self.side_m
 
+    @property
+    def size_in_memory(self) -> int:
+        """Of the mask and of the weights, which a network that answers has once more [bytes]."""
+        return 2 * self.parameters.nbytes + self.mask.flags.nbytes
+
     def make_field(self, backend: str = "auto") -> FieldModel:
         """The region's network, ready to be asked."""
         field = make_field(self.architecture.field_config(backend), 0)

@@ -16,6 +16,8 @@ _TF_TYPE = "tf2_msgs/msg/TFMessage"
 _EXTRINSICS_TYPE = "realsense2_camera_msgs/msg/Extrinsics"
 _TF_MESSAGES_SEARCHED = 2000
 """Static frames of ROS 1 bags are repeated on /tf, at least once a second."""
+MAX_FRAMES = 2000
+"""Further frames are passed over: no robot has so many, and whoever sends them takes memory."""
 
 
 def depth_to_color(source: MessageSource, depth_frame: str, color_frame: str) -> se3.Pose:
@@ -63,7 +65,7 @@ def _realsense_extrinsics(source: MessageSource) -> se3.Pose | None:
 
 
 class FrameTree:
-    """Fixed transforms between named frames."""
+    """Fixed transforms between named frames, of which there are at most `MAX_FRAMES`."""
 
     def __init__(self) -> None:
         self._neighbours: dict[str, dict[str, se3.Pose]] = {}
@@ -77,11 +79,15 @@ class FrameTree:
             quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
             translation = np.array([position.x, position.y, position.z])
             usable = np.isfinite(translation).all() and 0 < np.linalg.norm(quaternion) < np.inf
-            if not usable:
+            new = {parent, child} - self._neighbours.keys()
+            if not usable or len(self._neighbours) + len(new) > MAX_FRAMES:
                 continue
             T_parent_child = se3.from_quaternion(translation, quaternion)
             self._neighbours.setdefault(parent, {})[child] = T_parent_child
             self._neighbours.setdefault(child, {})[parent] = se3.inverse(T_parent_child)
+
+    def __contains__(self, frame: str) -> bool:
+        return frame in self._neighbours
 
     def lookup(self, target: str, origin: str) -> se3.Pose | None:
         """T_target_origin (4, 4), or None when the frames are not connected."""

@@ -25,6 +25,7 @@ from meslam_core.report.run_folder import RunFolder
 from meslam_core.report.time_figures import (
     STATE_COLORS,
     growth_figure,
+    growth_rows,
     stages_figure,
     tracking_figure,
 )
@@ -89,7 +90,7 @@ def write_report(
         groups=result_groups(runs),
         error=error_figure(compared) if compared else None,
         tracking=tracking_figure(recorded) if recorded else None,
-        growth=growth_figure(recorded) if recorded else None,
+        growth=growth_figure(recorded) if growth_rows(recorded) else None,
         state_colors=STATE_COLORS,
         depth_limit_cm=100 * map_views.LIMIT_M,
         depth_colors=Markup(map_views.color_bar()),

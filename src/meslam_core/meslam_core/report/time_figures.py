@@ -72,10 +72,15 @@ def tracking_figure(runs: Numbered) -> Figure:
     return figure
 
 
+def growth_rows(runs: Numbered) -> list[tuple[str, str, float]]:
+    """What is known of `GROWTH`."""
+    return [row for row in GROWTH if any(_frames(run).known(row[0]) for _, run in runs)]
+
+
 @drawn("The map's size, regions, keyframes and the memory over time")
 def growth_figure(runs: Numbered) -> Figure:
-    """What grows during a run."""
-    known = [row for row in GROWTH if any(_frames(run).known(row[0]) for _, run in runs)]
+    """What grows during runs that tell any of it."""
+    known = growth_rows(runs)
     figure = Figure(figsize=(WIDE, 1.35 * len(known) + 0.6), layout="constrained")
     axes = _stack(figure, len(known), [1.0] * len(known))
     for below, (name, label, scale) in zip(axes, known, strict=True):

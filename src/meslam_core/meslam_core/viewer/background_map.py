@@ -60,6 +60,8 @@ class BackgroundMap:
         self._sliced: tuple[object, ...] = ()
         self._sliced_s = float("-inf")
         self._stopping = threading.Event()
+        # Why there is nobody any more who would make an export.
+        self._over = ""
         self._process = MapProcess()
         self._thread = threading.Thread(target=self._run, name="viewer map", daemon=True)
         self._thread.start()
@@ -68,6 +70,11 @@ class BackgroundMap:
     def process(self) -> MapProcess:
         """That works at present."""
         return self._process
+
+    @property
+    def given_up(self) -> bool:
+        """Whether nothing is made any more."""
+        return bool(self._over)
 
     def begin(self) -> None:
         """Forget all regions; another map begins."""
@@ -88,15 +95,16 @@ class BackgroundMap:
             suffix: of the file's name, one of `map.mesh_file.FORMATS`.
 
         Raises:
-            MapError: when there is no map, it would be too large, or another one is being made.
+            MapError: when there is no map, it would be too large, another one is being made, or
+                the viewer makes none any more.
         """
         if not self._exporting.acquire(blocking=False):
             raise MapError("another mesh is being made; try again in a moment")
         try:
             future: Future[bytes] = Future()
             with self._lock:
-                if self._stopping.is_set():
-                    raise MapError("the viewer is being closed")
+                if self._over:
+                    raise MapError(self._over)
                 self._wanted = resolution_m, suffix, future
             return future.result()
         finally:
@@ -107,9 +115,19 @@ class BackgroundMap:
         self._stopping.set()
         self._process.close()
         self._thread.join()
-        self._refuse_export("the viewer is being closed")
 
     def _run(self) -> None:
+        try:
+            self._serve()
+        finally:
+            over = "the viewer is being closed"
+            if not self._stopping.is_set():
+                over = "the viewer makes no mesh any more; its log says why"
+            with self._lock:
+                self._over = over
+            self._refuse_export(over)
+
+    def _serve(self) -> None:
         failures, complaint = 0, ""
         while not self._stopping.is_set():
             try:
@@ -172,10 +190,14 @@ class BackgroundMap:
     def _make_export(self, resolution_m: float, suffix: str, future: Future[bytes]) -> None:
         request = {"do": "export", "resolution_m": resolution_m, "suffix": suffix}
         try:
-            future.set_result(self._process.ask(request)[1])
+            content = self._process.ask(request)[1]
         except MapError as error:
-            future.set_exception(error)
-        self._wanted = None
+            self._refuse_export(str(error))
+        else:
+            # Before it is answered: the next one may be wanted at once.
+            with self._lock:
+                self._wanted = None
+            future.set_result(content)
 
     def _slice(self) -> bool:
         """Renew the occupancy if it is wanted and out of date."""

@@ -166,7 +166,8 @@ def run(cell: Cell) -> str:
     if ended.returncode == 0:
         return ""
     said = log.read_text().strip().splitlines() if log.exists() else []
-    return (said or ended.stderr.strip().splitlines() or ["no message"])[-1]
+    status = f"signal {-ended.returncode}" if ended.returncode < 0 else f"{ended.returncode}"
+    return (said or ended.stderr.strip().splitlines() or [f"ended without a word ({status})"])[-1]
 
 
 def run_all(cells: list[Cell], console: Console) -> Failures:

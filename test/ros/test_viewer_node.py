@@ -51,7 +51,6 @@ class Tracker:
         """What no tracking says, and somebody else may."""
         nowhere = PoseStamped()
         nowhere.pose.position.x = float("nan")
-        self._pose.publish(nowhere)
         self._path.publish(nav_msgs.msg.Path(poses=[nowhere]))
         self._info.publish(CameraInfo())
 

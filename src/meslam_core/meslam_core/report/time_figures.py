@@ -129,7 +129,8 @@ def stages_figure(run: RunFolder) -> Figure:
     axes.set_ylim(0, 1.2 * max(shown_ms, 1.0))
     axes.margins(x=0.01)
     axes.set(xlabel="time [s]", ylabel="time of a frame [ms]")
-    axes.legend(loc="upper right", ncols=3)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper right", ncols=3)
     return figure
 
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from geometry_msgs.msg import Pose
 
 from meslam_core.errors import FrameError, MapError
-from meslam_core.map.manifest import MAX_REGIONS
-from meslam_core.regions.grid import RegionIndex
+from meslam_core.regions.grid import MAX_REGIONS, RegionIndex
 from meslam_interfaces.msg import Region, RegionArray, RegionModel
 from meslam_ros.conversions import from_pose, stamp_ns, to_stamp
 

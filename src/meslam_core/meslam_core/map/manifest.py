@@ -13,13 +13,12 @@ import numpy as np
 from meslam_core.config import RegionsConfig
 from meslam_core.errors import MapError
 from meslam_core.map.stored_region import StoredRegion
-from meslam_core.regions.grid import RegionGrid, RegionIndex
+from meslam_core.regions.grid import MAX_REGIONS, RegionGrid, RegionIndex
 
 MANIFEST = "manifest.json"
 MAP_FORMAT = "meslam-map"
 MAP_VERSION = 1
 MAX_MANIFEST_BYTES = 16 << 20
-MAX_REGIONS = 100_000
 OFF_LATTICE = 1 << 20  # added to the third index of regions that lie on another lattice
 
 _DIGEST = re.compile(rb'"sha256": "([0-9a-f]{64})"\n\}\n\Z')

@@ -12,6 +12,9 @@ from meslam_core.config import RegionsConfig
 
 RegionIndex = tuple[int, int, int]
 
+MAX_REGIONS = 100_000
+"""Of a map, however it comes: far more than anybody walks through, and few enough to list."""
+
 
 @dataclass(frozen=True)
 class RegionGrid:

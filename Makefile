@@ -31,7 +31,7 @@ faults: setup  ## inject all faults and write docs/reliability.md; FAULTS="input
 benchmark: setup  ## every recording in MESLAM_DATA x every method: hours, resumable; docs/evaluation.md
 	@$(IN_ENV) python benchmarks/evaluation.py $(BENCHMARK_ARGS)
 
-benchmark-quick: setup  ## the same with few frames and one seed: ten minutes
+benchmark-quick: setup  ## the same with few frames and one seed: eleven minutes
 	@$(IN_ENV) python benchmarks/evaluation.py --quick $(BENCHMARK_ARGS)
 
 lint: setup  ## check style and formatting

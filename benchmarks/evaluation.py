@@ -239,7 +239,7 @@ def write_page(cells: list[Cell], target: Path) -> None:
 
 def parsed_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="ten minutes: few frames, one seed")
+    parser.add_argument("--quick", action="store_true", help="few frames, one seed")
     parser.add_argument("--dry-run", action="store_true", help="list the cells")
     parser.add_argument("--recordings", nargs="+", metavar="NAME", help="these only")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="these only")
